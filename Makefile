@@ -1,0 +1,55 @@
+# Every target makes .venv first if it is missing or older than what it was made from.
+
+PYTHON ?= python3
+RUN_DIR ?= runs/walker-stand
+ARGS ?=
+
+VENV := .venv
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help train test lint bench clean
+
+help:
+	@echo "make train   train on walker-stand on a CPU (RUN_DIR=runs/walker-stand, ARGS=\"more options\")"
+	@echo "make test    run the tests and the examples in docstrings (ARGS=\"pytest options\")"
+	@echo "make lint    check the code with ruff"
+	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
+	@echo "make clean   remove .venv, caches and build output; runs/ stays"
+	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
+
+train: $(READY)
+	@$(VENV)/bin/python examples/train_dmc.py task=walker-stand preset=cpu seed=1 total_env_steps=40000 run_dir=$(RUN_DIR) $(ARGS)
+
+test: export MUJOCO_GL ?= disable
+test: $(READY)
+	@$(VENV)/bin/python -m pytest $(ARGS)
+
+lint: $(READY)
+	@$(VENV)/bin/ruff check
+
+bench: $(READY)
+	@if [ -d benchmarks ]; then $(VENV)/bin/python -m pytest benchmarks --benchmark-only $(ARGS); \
+	else echo "error: there is no benchmarks/ here; run make bench in a full checkout" >&2; exit 1; fi
+
+# The mark is written last, so that an interrupted installation starts over; and it starts from nothing, because
+# packages that share files (mujoco 3 and 4) cannot be replaced in place.
+$(READY): requirements-pins.txt pyproject.toml
+	@command -v $(PYTHON) >/dev/null 2>&1 || \
+		{ echo "error: $(PYTHON) not found; install Python 3.11 or 3.12, or: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || \
+		{ echo "error: $(PYTHON) is $$($(PYTHON) -V 2>&1), but 3.11 or 3.12 is needed; choose one: make PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ echo "error: $(PYTHON) has no venv module; on Debian: apt-get install python3-venv" >&2; exit 1; }
+	@echo "creating $(VENV)"
+	@rm -rf $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+	@echo "installing pinned dependencies (about 1.6 GB, more if torch brings CUDA)"
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements-pins.txt
+	@echo "installing torchrl_etdmpc in editable mode"
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps -e .
+	@touch $@
+
+clean:
+	@rm -rf $(VENV) build dist .benchmarks .hypothesis .pytest_cache .ruff_cache
+	@find . -path ./runs -prune -o \( -name __pycache__ -o -name '*.egg-info' \) -type d -prune -exec rm -rf {} +

@@ -1,0 +1,41 @@
+"""EfficientTDMPC for TorchRL: a world model with a dynamics ensemble, planned over and distilled into a policy.
+
+Dimensions, everywhere in the package: ``B`` batch, ``T`` steps of a replayed slice, ``N`` candidates, ``P`` proposals,
+``K`` elites, ``I`` iterations, ``H`` horizon, ``D`` depths of the return table, ``F`` dynamics heads, ``V`` value heads,
+``A`` action, ``L`` latent, ``O`` observation, ``M`` bins. ``[..., N, H, A]`` reads "any leading batch, then candidates,
+steps, action dimensions".
+"""
+
+from torchrl_etdmpc.collectors import NonFiniteError, SeedPolicy, StepCollector
+from torchrl_etdmpc.envs import LatentEnv
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import (
+    EfficientTDMPCLoss,
+    EfficientTDMPCModelLoss,
+    EfficientTDMPCPolicyLoss,
+    EfficientTDMPCValueLoss,
+)
+from torchrl_etdmpc.planners import AdaptiveScore, EnsembleMPPIPlanner, FinalScore, MeanScore, Plan, PlanTrace
+from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AdaptiveScore",
+    "EfficientTDMPCLoss",
+    "EfficientTDMPCModelLoss",
+    "EfficientTDMPCPolicyLoss",
+    "EfficientTDMPCValueLoss",
+    "EnsembleMPPIPlanner",
+    "FinalScore",
+    "LatentEnv",
+    "MeanScore",
+    "NonFiniteError",
+    "Plan",
+    "PlanTrace",
+    "ReanalyzeTransform",
+    "SeedPolicy",
+    "StepCollector",
+    "StepSliceSampler",
+    "WorldModel",
+]

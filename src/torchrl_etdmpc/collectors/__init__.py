@@ -1,0 +1,6 @@
+"""Collection, one step at a time."""
+
+from torchrl_etdmpc.collectors.seed_policy import SeedPolicy
+from torchrl_etdmpc.collectors.step import NonFiniteError, StepCollector
+
+__all__ = ["NonFiniteError", "SeedPolicy", "StepCollector"]

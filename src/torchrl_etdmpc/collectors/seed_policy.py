@@ -1,0 +1,60 @@
+"""The policy of the seed phase: uniform actions, with the planner's whole schema."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Bounded, TensorSpec
+
+
+class SeedPolicy(TensorDictModuleBase):
+    """Uniform random actions, stored with the target N(0, 1) (BMPC), under the keys that the planner writes.
+
+    Writing the whole schema from the first row on matters: a storage leaves missing entries uninitialised.
+
+    Args:
+        action_spec (TensorSpec): bounds of the action, of the whole batch of environments.
+
+    Keyword Args:
+        action_key (NestedKey): Default: ``"action"``.
+        plan_key (NestedKey): root of the target. Default: ``"plan"``.
+
+    Raises:
+        ValueError: if the action is not bounded.
+
+    >>> from tensordict import TensorDict
+    >>> policy = SeedPolicy(Bounded(-1, 1, shape=(2,)))
+    >>> policy(TensorDict())["plan", "scale"].tolist()
+    [1.0, 1.0]
+    """
+
+    def __init__(
+        self, action_spec: TensorSpec, *, action_key: NestedKey = "action", plan_key: NestedKey = "plan"
+    ) -> None:
+        super().__init__()
+        if not isinstance(action_spec, Bounded):
+            raise ValueError(f"SeedPolicy needs a bounded continuous action, got {type(action_spec).__name__}.")
+        self.action_spec = action_spec
+        self.action_key = unravel_key(action_key)
+        self.plan_keys = {
+            name: unravel_key((plan_key, name)) for name in ("loc", "scale", "value", "version", "fallback")
+        }
+        self.in_keys = []
+        self.out_keys = [self.action_key, *self.plan_keys.values()]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes an action and its target."""
+        action = self.action_spec.rand()
+        flag = torch.zeros_like(action[..., :1])
+        values = {
+            "loc": torch.zeros_like(action),
+            "scale": torch.ones_like(action),
+            "value": flag,
+            "version": flag.to(torch.int64),
+            "fallback": flag.bool(),
+        }
+        tensordict.set(self.action_key, action)
+        for name, value in values.items():
+            tensordict.set(self.plan_keys[name], value)
+        return tensordict

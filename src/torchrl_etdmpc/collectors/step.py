@@ -1,0 +1,244 @@
+"""Collection one environment step at a time, into a replay buffer."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import nn
+from torchrl.collectors import BaseCollector
+from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase, ExplorationType
+from torchrl.envs.utils import set_exploration_type
+
+TRAJ_KEY = ("collector", "traj_ids")
+
+Insertion = Literal["step", "episode"]
+
+
+class NonFiniteError(RuntimeError):
+    """The environment or the policy returned a value that is not finite."""
+
+
+class StepCollector(BaseCollector):
+    """Acts, steps and stores, one step of every environment per iteration (thesis 3.4.4, data freshness).
+
+    With ``insertion="step"`` a transition is in the buffer before the next action is chosen; with ``"episode"`` it is
+    kept back until its episode ends (BMPC). Rows of several environments are interleaved in the order of the
+    environments; each row carries the id of its trajectory.
+
+    Follows the contract of TorchRL's collectors: iterable, ``state_dict``, ``set_seed``, trajectory ids, exploration
+    type, primers of the policy registered on the environment. The policy object is used as it is, so there are no
+    weights to synchronise. One iteration yields the transitions just made, batch size ``[num_envs]``.
+
+    Args:
+        create_env_fn (EnvBase or callable): an environment (of any batch size) or a function that makes it. It is closed
+            by :meth:`shutdown`.
+        policy (nn.Module): TensorDict module that writes the action, e.g. a planner.
+
+    Keyword Args:
+        replay_buffer (ReplayBuffer): where transitions go.
+        total_frames (int): decisions to make, all environments together; -1 for no end. Default: -1.
+        init_random_frames (int): length of the seed phase in decisions, all environments together. Default: 0.
+        seed_policy (nn.Module, optional): acts in the seed phase; it must write what ``policy`` writes and
+            the buffer keeps, e.g. :class:`SeedPolicy`. Required if ``init_random_frames`` is positive.
+        insertion (str): ``"step"`` or ``"episode"``. Default: ``"step"``.
+        exclude_keys (sequence of NestedKey): what not to store. Default: the warm start, ``"plan_mean"`` and
+            ``("next", "plan_mean")``.
+        exploration_type (ExplorationType): Default: ``RANDOM``.
+        policy_device (torch.device, optional): where the policy's inputs go. Default: the environment's device.
+
+    Raises:
+        ValueError: if an argument is out of range.
+        NonFiniteError: while iterating, if an observation, a reward or an action is not finite; the step is not stored.
+
+    >>> from torchrl.data import LazyTensorStorage
+    >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+    >>> from torchrl.envs.utils import RandomPolicy
+    >>> env, buffer = ContinuousActionVecMockEnv(), ReplayBuffer(storage=LazyTensorStorage(100))
+    >>> collector = StepCollector(env, RandomPolicy(env.action_spec), replay_buffer=buffer, total_frames=5)
+    >>> for step in collector:
+    ...     pass
+    >>> len(buffer)
+    5
+    """
+
+    def __init__(
+        self,
+        create_env_fn: EnvBase | Callable[[], EnvBase],
+        policy: nn.Module,
+        *,
+        replay_buffer: ReplayBuffer,
+        total_frames: int = -1,
+        init_random_frames: int = 0,
+        seed_policy: nn.Module | None = None,
+        insertion: Insertion = "step",
+        exclude_keys: Sequence[NestedKey] = ("plan_mean", ("next", "plan_mean")),
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+        policy_device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        if init_random_frames > 0 and seed_policy is None:
+            raise ValueError(
+                f"init_random_frames={init_random_frames} needs a seed_policy that writes what the policy writes; pass "
+                "seed_policy=SeedPolicy(env.action_spec)."
+            )
+        if insertion not in ("step", "episode"):
+            raise ValueError(f"insertion must be 'step' or 'episode', got {insertion!r}.")
+        env = create_env_fn if isinstance(create_env_fn, EnvBase) else create_env_fn()
+        if len(env.batch_size) > 1:
+            raise ValueError(f"StepCollector takes an environment with at most one batch dimension, got {env.batch_size}.")
+        self.env = _with_primer(env, policy)
+        self.policy = policy
+        self.replay_buffer = replay_buffer
+        self.total_frames = total_frames
+        self.init_random_frames = init_random_frames
+        self.seed_policy = seed_policy
+        self.insertion = insertion
+        self.exclude_keys = [unravel_key(key) for key in exclude_keys]
+        self.exploration_type = exploration_type
+        self.policy_device = None if policy_device is None else torch.device(policy_device)
+        self.num_envs = max(self.env.batch_size.numel(), 1)
+        self.closed = False
+        self._frames = 0
+        self._next_trajectory = 0
+        self._carrier: TensorDictBase | None = None
+        self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
+        self._schema: dict[bool, set] = {}
+        observation_keys = [unravel_key(("next", key)) for key in self.env.observation_spec.keys(True, True)]
+        excluded = set(self.exclude_keys)
+        self._checked = [key for key in observation_keys if key not in excluded] + [
+            unravel_key(("next", key)) for key in self.env.reward_keys
+        ]
+
+    @property
+    def frames(self) -> int:
+        """Decisions made so far, all environments together."""
+        return self._frames
+
+    @property
+    def in_seed_phase(self) -> bool:
+        """Whether the next decision belongs to the seed phase."""
+        return self._frames < self.init_random_frames
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Yields the transitions of one step of every environment, batch size [num_envs], until ``total_frames``."""
+        while self.total_frames < 0 or self._frames < self.total_frames:
+            yield self.step()
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        return self.iterator()
+
+    @torch.no_grad()
+    def step(self) -> TensorDictBase:
+        """One decision of every environment: act, step, check, store."""
+        if self._carrier is None:
+            self._carrier = self._start(self.env.reset())
+        seeding = self.in_seed_phase
+        with set_exploration_type(self.exploration_type):
+            tensordict = self._act(self._carrier, seeding)
+        self._check_finite(tensordict, self.env.action_keys, "the policy")
+        stepped, carrier = self.env.step_and_maybe_reset(tensordict)
+        self._check_finite(stepped, self._checked, "the environment")
+        rows = stepped.exclude(*self.exclude_keys).reshape(-1)
+        self._check_schema(rows, seeding)
+        self._store(rows)
+        self._frames += self.num_envs
+        done = stepped.get(("next", "done")).reshape(self.num_envs)
+        self._carrier = self._next_carrier(carrier, stepped, done)
+        return rows
+
+    def _act(self, tensordict: TensorDictBase, seeding: bool) -> TensorDictBase:
+        policy = self.seed_policy if seeding else self.policy
+        if self.policy_device is None or seeding:
+            return policy(tensordict)
+        inputs = tensordict.select(*policy.in_keys, strict=False).to(self.policy_device)
+        outputs = policy(inputs).select(*policy.out_keys, strict=False).to(self.env.device or "cpu")
+        return tensordict.update(outputs)
+
+    def _start(self, tensordict: TensorDictBase) -> TensorDictBase:
+        ids = torch.arange(self.num_envs) + self._next_trajectory
+        self._next_trajectory += self.num_envs
+        return tensordict.set(TRAJ_KEY, ids.reshape(tensordict.batch_size))
+
+    def _next_carrier(self, carrier: TensorDictBase, stepped: TensorDictBase, done: torch.Tensor) -> TensorDictBase:
+        ids = stepped.get(TRAJ_KEY).reshape(self.num_envs).clone()
+        for position in done.nonzero().flatten().tolist():
+            ids[position] = self._next_trajectory
+            self._next_trajectory += 1
+        return carrier.set(TRAJ_KEY, ids.reshape(carrier.batch_size))
+
+    def _store(self, rows: TensorDictBase) -> None:
+        if self.insertion == "step":
+            self.replay_buffer.extend(rows.clone(False))
+            return
+        for position, row in enumerate(rows.unbind(0)):
+            self._pending[position].append(row.clone())
+            if row.get(("next", "done")).any():
+                self.replay_buffer.extend(torch.stack(self._pending[position]))
+                self._pending[position] = []
+
+    def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:
+        for key in keys:
+            value = tensordict.get(key)
+            if value.is_floating_point() and not value.isfinite().all():
+                rows = value.isfinite().reshape(self.num_envs, -1).all(-1).logical_not().nonzero().flatten().tolist()
+                raise NonFiniteError(
+                    f"{source} returned a non-finite {key!r} at decision step {self._frames} (environments {rows}); the step "
+                    "was not stored."
+                )
+
+    def _check_schema(self, rows: TensorDictBase, seeding: bool) -> None:
+        if seeding in self._schema:
+            return
+        self._schema[seeding] = keys = set(rows.keys(True, True))
+        other = self._schema.get(not seeding)
+        if other is not None and other != keys:
+            raise ValueError(
+                f"seed_policy and policy must write the same keys; they differ in {sorted(map(str, other ^ keys))}. A row "
+                "without a key would hold uninitialised memory."
+            )
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seeds the environments; the running episode is abandoned."""
+        self._carrier = None
+        self._pending = [[] for _ in range(self.num_envs)]
+        return self.env.set_seed(seed, static_seed=static_seed)
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing to do: the policy object is shared with the caller."""
+
+    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
+        """Closes the environments."""
+        if close_env and not self.closed and not self.env.is_closed:
+            self.env.close(raise_if_closed=raise_on_error)
+        self.closed = True
+
+    def state_dict(self) -> OrderedDict:
+        """Counters: decisions made and the next trajectory id (neither the policy nor the simulator)."""
+        return OrderedDict(frames=self._frames, next_trajectory=self._next_trajectory)
+
+    def load_state_dict(self, state_dict: OrderedDict) -> None:
+        """Restores the counters; collection goes on with a fresh episode and a fresh trajectory id."""
+        self._frames = state_dict["frames"]
+        self._next_trajectory = state_dict["next_trajectory"]
+        self._carrier = None
+        self._pending = [[] for _ in range(self.num_envs)]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(num_envs={self.num_envs}, frames={self._frames}, insertion={self.insertion!r})"
+
+
+def _with_primer(env: EnvBase, policy: nn.Module) -> EnvBase:
+    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already."""
+    make_primer = getattr(policy, "make_tensordict_primer", None)
+    if make_primer is None or not getattr(policy, "warm_start", True):
+        return env
+    primer = make_primer()
+    present = set(env.full_observation_spec.keys(True, True)) | set(env.full_state_spec.keys(True, True))
+    if all(unravel_key(key) in present for key in primer.primers.keys(True, True)):
+        return env
+    return env.append_transform(primer)

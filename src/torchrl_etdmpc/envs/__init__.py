@@ -1,0 +1,18 @@
+"""Environments: the benchmark tasks as TorchRL environments, and the world model as one."""
+
+from __future__ import annotations
+
+from torchrl_etdmpc.envs.dmc import make_dmc_env, render_frame
+from torchrl_etdmpc.envs.latent import LatentEnv
+from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task
+
+__all__ = [
+    "DMC_TASKS",
+    "EASY_DMC",
+    "HARD_DMC",
+    "LatentEnv",
+    "Task",
+    "get_task",
+    "make_dmc_env",
+    "render_frame",
+]

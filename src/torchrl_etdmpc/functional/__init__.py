@@ -1,0 +1,45 @@
+"""Pure maths on tensors: no state, no modules, any leading batch."""
+
+from torchrl_etdmpc.functional.gaussian import bounded_log_std, clipped_sample, gaussian_entropy, gaussian_kl
+from torchrl_etdmpc.functional.horizon import adaptive_mixture, ensemble_mean, ensemble_variance
+from torchrl_etdmpc.functional.mppi import (
+    Elites,
+    Gaussian,
+    elite_weights,
+    fit_gaussian,
+    sample_elite,
+    sample_sequences,
+    select_elites,
+    shift_plan,
+)
+from torchrl_etdmpc.functional.returns import discount_from_episode_length, return_table
+from torchrl_etdmpc.functional.running_scale import updated_scale
+from torchrl_etdmpc.functional.simnorm import simnorm
+from torchrl_etdmpc.functional.two_hot import symexp, symlog, two_hot_cross_entropy, two_hot_decode, two_hot_encode
+
+__all__ = [
+    "Elites",
+    "Gaussian",
+    "adaptive_mixture",
+    "bounded_log_std",
+    "clipped_sample",
+    "discount_from_episode_length",
+    "elite_weights",
+    "ensemble_mean",
+    "ensemble_variance",
+    "fit_gaussian",
+    "gaussian_entropy",
+    "gaussian_kl",
+    "return_table",
+    "sample_elite",
+    "sample_sequences",
+    "select_elites",
+    "shift_plan",
+    "simnorm",
+    "symexp",
+    "symlog",
+    "two_hot_cross_entropy",
+    "two_hot_decode",
+    "two_hot_encode",
+    "updated_scale",
+]

@@ -1,0 +1,87 @@
+"""Reductions of the return table: ensemble mean, variance of the mean, and the exact adaptive horizon mixture."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SIGMA_FLOOR = 1e-6  # standard deviations below this count as this
+
+
+def ensemble_mean(returns: Tensor) -> Tensor:
+    """Mean over dynamics and value heads (thesis Eq. 3.2).
+
+    Args:
+        returns (Tensor): return estimates, shape ``[..., F, V]``.
+
+    Returns:
+        Tensor: shape ``[...]``.
+
+    >>> ensemble_mean(torch.tensor([[1.0, 3.0]])).item()
+    2.0
+    """
+    return returns.mean((-2, -1))
+
+
+def ensemble_variance(returns: Tensor) -> Tensor:
+    """Estimated variance of the ensemble mean, ``sum (Q - mean)^2 / (M (M - 1))`` with M = F V (thesis Eq. 3.3).
+
+    Args:
+        returns (Tensor): return estimates, shape ``[..., F, V]``.
+
+    Returns:
+        Tensor: variances, shape ``[...]``; zero when M = 1.
+
+    >>> ensemble_variance(torch.tensor([[1.0, 3.0]])).item()
+    1.0
+    """
+    members = returns.shape[-2] * returns.shape[-1]
+    if members == 1:
+        return torch.zeros_like(returns[..., 0, 0])
+    deviation = returns - returns.mean((-2, -1), keepdim=True)
+    return deviation.square().sum((-2, -1)) / (members * (members - 1))
+
+
+def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Tensor]:
+    r"""Best lower confidence bound over convex mixtures of depths, exactly (thesis Eq. 4.14).
+
+    Maximises ``w.q - beta sqrt(sum_h w_h^2 sigma_h^2)`` over the simplex. The thesis proposes a gradient-based solver;
+    the optimum has a closed form. Stationarity gives ``w_h ~ max(q_h - lambda, 0) / sigma_h^2``, where the optimal value
+    lambda is the unique root of ``sum_h (max(q_h - lambda, 0) / sigma_h)^2 = beta^2``. The left side falls in lambda, so
+    the depths in the support are those h at which it is still below ``beta^2`` when lambda = q_h; the root over a known
+    support is that of a quadratic.
+
+    Args:
+        mean (Tensor): q, mean return estimate of each depth, shape ``[..., H]``.
+        std (Tensor): sigma, its standard deviation, shape ``[..., H]``; floored at ``SIGMA_FLOOR``.
+        beta (float): weight of the standard deviation, >= 0; 0 gives ``max_h q_h``.
+
+    Returns:
+        tuple[Tensor, Tensor]: the optimal value, shape ``[...]``, and the weights, shape ``[..., H]``.
+
+    Raises:
+        ValueError: if beta is negative (the problem is then not concave).
+
+    >>> value, weights = adaptive_mixture(torch.tensor([1.0, 1.0]), torch.tensor([1.0, 1.0]), beta=1.0)
+    >>> weights.tolist(), round(value.item(), 4)
+    ([0.5, 0.5], 0.2929)
+    """
+    if beta < 0:
+        raise ValueError(f"adaptive_mixture needs beta >= 0, got {beta}; use the final or mean score for optimism.")
+    best, best_depth = mean.max(-1, keepdim=True)
+    one_hot = torch.zeros_like(mean).scatter(-1, best_depth, 1.0)
+    if beta == 0:
+        return best.squeeze(-1), one_hot
+    gap = mean - best  # <= 0: all sums below are relative to the best depth, which keeps them exact in float32
+    precision = std.clamp_min(SIGMA_FLOOR).square().reciprocal()
+    excess = (gap.unsqueeze(-2) - gap.unsqueeze(-1)).clamp_min(0)  # [..., h, g] = max(q_g - q_h, 0)
+    support = (precision.unsqueeze(-2) * excess.square()).sum(-1) < beta**2
+    weight = precision * support
+    total = weight.sum(-1, keepdim=True)
+    centre = (weight * gap).sum(-1, keepdim=True) / total
+    spread = (weight * (gap - centre).square()).sum(-1, keepdim=True)
+    root = centre - ((beta**2 - spread).clamp_min(0) / total).sqrt()
+    weights = (gap - root).clamp_min(0) * precision
+    norm = weights.sum(-1, keepdim=True)
+    weights = torch.where(norm > 0, weights / norm.clamp_min(torch.finfo(norm.dtype).tiny), one_hot)
+    return (best + root).squeeze(-1), weights

@@ -1,0 +1,88 @@
+"""Distributional scalars: symlog two-hot encoding, decoding and cross-entropy.
+
+Scalars are classified over ``M`` bins that are evenly spaced in symlog space (DreamerV3, arXiv:2301.04104;
+TD-MPC2, arXiv:2310.16828). The interpolation happens in symlog space, as TD-MPC2 and BMPC do it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def symlog(x: Tensor) -> Tensor:
+    """Symmetric logarithm ``sign(x) ln(1 + |x|)`` (DreamerV3, Eq. 9), elementwise over any shape.
+
+    >>> symlog(torch.tensor([0.0, -1.0])).tolist()
+    [0.0, -0.6931471824645996]
+    """
+    return x.sign() * x.abs().log1p()
+
+
+def symexp(x: Tensor) -> Tensor:
+    """Inverse of :func:`symlog`, ``sign(x) (exp(|x|) - 1)``, elementwise over any shape.
+
+    >>> round(symexp(symlog(torch.tensor(3.0))).item(), 4)
+    3.0
+    """
+    return x.sign() * x.abs().expm1()
+
+
+def two_hot_encode(x: Tensor, bins: Tensor) -> Tensor:
+    """Splits each scalar's mass linearly between the two neighbouring bins, in symlog space.
+
+    The weight of bin m is ``max(0, 1 - |position - m|)``, where position is the scalar's fractional bin index. A
+    value outside the bins puts all its mass in the end bin; a NaN stays NaN.
+
+    Args:
+        x (Tensor): scalars in the units of the environment (reward or return), shape ``[...]``.
+        bins (Tensor): bin centres in symlog space, evenly spaced and ascending, shape ``[M]`` with M >= 2.
+
+    Returns:
+        Tensor: weights that sum to one, shape ``[..., M]``.
+
+    >>> bins = torch.linspace(-10, 10, 101)
+    >>> two_hot_encode(torch.tensor(0.0), bins)[50].item()
+    1.0
+    """
+    num_bins = bins.shape[-1]
+    width = (bins[-1] - bins[0]) / (num_bins - 1)
+    position = ((symlog(x) - bins[0]) / width).clamp(0, num_bins - 1)
+    index = torch.arange(num_bins, device=bins.device, dtype=bins.dtype)
+    return (1 - (position.unsqueeze(-1) - index).abs()).clamp_min(0)
+
+
+def two_hot_decode(logits: Tensor, bins: Tensor) -> Tensor:
+    """Expected scalar of a categorical distribution over symlog bins: ``symexp(sum(softmax(logits) * bins))``.
+
+    Args:
+        logits (Tensor): unnormalised log-probabilities, shape ``[..., M]``.
+        bins (Tensor): bin centres in symlog space, shape ``[M]``.
+
+    Returns:
+        Tensor: scalars in the units of the environment, shape ``[...]``.
+
+    >>> bins = torch.linspace(-10, 10, 101)
+    >>> weights = two_hot_encode(torch.tensor(7.0), bins)
+    >>> round(two_hot_decode(weights.clamp_min(1e-30).log(), bins).item(), 3)
+    7.0
+    """
+    return symexp(logits.softmax(-1) @ bins)
+
+
+def two_hot_cross_entropy(logits: Tensor, target: Tensor, bins: Tensor) -> Tensor:
+    """Cross-entropy between the two-hot target and the log-softmax of the logits (thesis 2.3; DreamerV3, Eq. 10).
+
+    Args:
+        logits (Tensor): unnormalised log-probabilities, shape ``[..., M]``.
+        target (Tensor): scalars in the units of the environment, broadcastable to ``[...]``.
+        bins (Tensor): bin centres in symlog space, shape ``[M]``.
+
+    Returns:
+        Tensor: cross-entropy in nats, shape ``[...]``.
+
+    >>> bins = torch.linspace(-10, 10, 101)
+    >>> two_hot_cross_entropy(torch.zeros(101), torch.tensor(1.5), bins).exp().round().item()
+    101.0
+    """
+    return -(two_hot_encode(target, bins) * logits.log_softmax(-1)).sum(-1)

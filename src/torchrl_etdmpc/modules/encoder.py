@@ -1,0 +1,43 @@
+"""The encoder h: observation to latent."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from torchrl_etdmpc.functional import simnorm
+from torchrl_etdmpc.modules.normed_linear import MLP, Activation
+
+
+class Encoder(MLP):
+    """Observation to latent, ``z = h(s)`` (thesis Table 3.1): hidden layers, then Linear, LayerNorm, SimNorm.
+
+    Args:
+        observation_dim (int): O.
+        latent_dim (int): L, a multiple of ``simnorm_dim``.
+        hidden_dim (int): size of each hidden layer.
+        num_layers (int): number of hidden layers.
+        simnorm_dim (int): group size of SimNorm.
+        activation (str): of the hidden layers.
+
+    >>> import torch
+    >>> Encoder(24, 512)(torch.zeros(2, 24)).shape
+    torch.Size([2, 512])
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        latent_dim: int,
+        *,
+        hidden_dim: int = 256,
+        num_layers: int = 1,
+        simnorm_dim: int = 8,
+        activation: Activation = "mish",
+    ) -> None:
+        super().__init__(
+            observation_dim,
+            [hidden_dim] * num_layers,
+            latent_dim,
+            activation=activation,
+            output_activation=partial(simnorm, group_size=simnorm_dim),
+        )

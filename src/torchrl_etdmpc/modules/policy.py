@@ -1,0 +1,53 @@
+"""The policy prior: latent to a diagonal Gaussian over actions."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchrl_etdmpc.functional import bounded_log_std
+from torchrl_etdmpc.modules.normed_linear import MLP, Activation
+
+
+class GaussianPolicy(MLP):
+    """Latent to ``mean = tanh(m)`` and a bounded log standard deviation (thesis 2.4, BMPC).
+
+    An action is ``clip(mean + std * eps, -1, 1)``; the density is that of the unclipped Gaussian.
+
+    Args:
+        latent_dim (int): L.
+        action_dim (int): A.
+        hidden_dim (int): size of both hidden layers.
+        log_std_bounds (tuple of float): smallest and largest log standard deviation.
+        activation (str): of the hidden layers.
+
+    >>> import torch
+    >>> mean, log_std = GaussianPolicy(16, 2)(torch.zeros(7, 16))
+    >>> mean.shape, log_std.shape
+    (torch.Size([7, 2]), torch.Size([7, 2]))
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        *,
+        hidden_dim: int = 512,
+        log_std_bounds: tuple[float, float] = (-3.0, 1.0),
+        activation: Activation = "mish",
+    ) -> None:
+        super().__init__(latent_dim, [hidden_dim] * 2, 2 * action_dim, activation=activation)
+        self.log_std_bounds = tuple(log_std_bounds)
+
+    def forward(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and log std of the action distribution.
+
+        Args:
+            latent (Tensor): shape ``[..., L]``.
+            log_std_bounds (tuple of float, optional): other bounds for this call (BMPC widens them to [-2, 1] when the
+                policy proposes trajectories to the reanalyze planner). Default: the policy's own.
+
+        Returns:
+            tuple[Tensor, Tensor]: mean in (-1, 1) and log std, both of shape ``[..., A]``.
+        """
+        mean, raw = super().forward(latent).chunk(2, dim=-1)
+        return mean.tanh(), bounded_log_std(raw, *(log_std_bounds or self.log_std_bounds))

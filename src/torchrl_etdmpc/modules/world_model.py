@@ -1,0 +1,180 @@
+"""The world model: encoder, dynamics ensemble, reward, value ensemble, policy, and (optionally) termination."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_etdmpc.functional import clipped_sample, two_hot_decode
+from torchrl_etdmpc.modules.dynamics import DynamicsEnsemble
+from torchrl_etdmpc.modules.encoder import Encoder
+from torchrl_etdmpc.modules.heads import RewardHead, TerminationHead, ValueEnsemble
+from torchrl_etdmpc.modules.normed_linear import Activation
+from torchrl_etdmpc.modules.policy import GaussianPolicy
+
+
+class WorldModel(nn.Module):
+    """All networks of EfficientTDMPC in one module (thesis Table 3.1 and Table A.1); prediction only.
+
+    One instance is shared by the planner, the losses and the reanalyze transform, so there is one set of weights and
+    nothing to synchronise within a process. Ensembles are stacked; latents of several heads carry the head dimension
+    first, ``[F, ..., L]``.
+
+    Args:
+        observation_dim (int): O, size of the flat observation.
+        action_dim (int): A.
+        latent_dim (int): L, a multiple of ``simnorm_dim``.
+        mlp_dim (int): hidden size of dynamics, reward, value, policy and termination.
+        encoder_dim (int): hidden size of the encoder.
+        encoder_layers (int): hidden layers of the encoder.
+        num_dynamics (int): F, dynamics heads.
+        num_values (int): V, value heads.
+        simnorm_dim (int): group size of SimNorm.
+        num_bins (int): M, bins of the reward and value distributions.
+        bin_range (tuple of float): first and last bin centre in symlog space.
+        dropout (float): of the first hidden layer of the value heads.
+        log_std_bounds (tuple of float): of the policy.
+        activation (str): ``"mish"``, ``"silu"`` or ``"relu"``.
+        termination (bool): whether to build a termination head. Default: ``False`` (DMC never terminates).
+
+    Raises:
+        ValueError: if a size is not positive or L is not a multiple of ``simnorm_dim``.
+
+    >>> model = WorldModel(24, 6, latent_dim=32, mlp_dim=64)
+    >>> latent = model.encode(torch.zeros(7, 24))
+    >>> model.next(latent.unsqueeze(0), torch.zeros(7, 6)).shape
+    torch.Size([4, 7, 32])
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        *,
+        latent_dim: int = 512,
+        mlp_dim: int = 512,
+        encoder_dim: int = 256,
+        encoder_layers: int = 1,
+        num_dynamics: int = 4,
+        num_values: int = 2,
+        simnorm_dim: int = 8,
+        num_bins: int = 101,
+        bin_range: tuple[float, float] = (-10.0, 10.0),
+        dropout: float = 0.01,
+        log_std_bounds: tuple[float, float] = (-3.0, 1.0),
+        activation: Activation = "mish",
+        termination: bool = False,
+    ) -> None:
+        super().__init__()
+        sizes = {
+            "observation_dim": observation_dim,
+            "action_dim": action_dim,
+            "latent_dim": latent_dim,
+            "mlp_dim": mlp_dim,
+            "encoder_dim": encoder_dim,
+            "encoder_layers": encoder_layers,
+            "num_dynamics": num_dynamics,
+            "num_values": num_values,
+            "simnorm_dim": simnorm_dim,
+        }
+        for name, size in sizes.items():
+            if size < 1:
+                raise ValueError(f"{name} must be at least 1, got {size}.")
+        if latent_dim % simnorm_dim:
+            raise ValueError(
+                f"latent_dim must be a multiple of simnorm_dim={simnorm_dim}, got {latent_dim}; "
+                f"the nearest is {max(round(latent_dim / simnorm_dim), 1) * simnorm_dim}."
+            )
+        if num_bins < 2 or bin_range[0] >= bin_range[1]:
+            raise ValueError(
+                f"num_bins must be at least 2 and bin_range ascending, got num_bins={num_bins}, bin_range={bin_range}."
+            )
+        self.observation_dim = observation_dim
+        self.action_dim = action_dim
+        self.latent_dim = latent_dim
+        self.num_dynamics = num_dynamics
+        self.num_values = num_values
+        self.encoder = Encoder(
+            observation_dim,
+            latent_dim,
+            hidden_dim=encoder_dim,
+            num_layers=encoder_layers,
+            simnorm_dim=simnorm_dim,
+            activation=activation,
+        )
+        self.dynamics = DynamicsEnsemble(
+            latent_dim,
+            action_dim,
+            num_heads=num_dynamics,
+            hidden_dim=mlp_dim,
+            simnorm_dim=simnorm_dim,
+            activation=activation,
+        )
+        self.reward_head = RewardHead(
+            latent_dim, action_dim, num_bins=num_bins, hidden_dim=mlp_dim, activation=activation
+        )
+        self.value_head = ValueEnsemble(
+            latent_dim,
+            num_heads=num_values,
+            num_bins=num_bins,
+            hidden_dim=mlp_dim,
+            dropout=dropout,
+            activation=activation,
+        )
+        self.policy = GaussianPolicy(
+            latent_dim, action_dim, hidden_dim=mlp_dim, log_std_bounds=log_std_bounds, activation=activation
+        )
+        self.termination_head = (
+            TerminationHead(latent_dim, hidden_dim=mlp_dim, activation=activation) if termination else None
+        )
+        self.register_buffer("bins", torch.linspace(*bin_range, num_bins))
+        self.register_buffer("version", torch.zeros((), dtype=torch.int64))
+        """How many gradient updates made these weights; stamped on every planner target."""
+
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights in every network (the hook that TorchRL's losses call)."""
+        for network in self.children():
+            network.reset_parameters_recursive()
+        self.version.zero_()
+
+    def encode(self, observation: Tensor) -> Tensor:
+        """Observation ``[..., O]`` to latent ``[..., L]``."""
+        return self.encoder(observation)
+
+    def next(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Steps every dynamics head on its own latent.
+
+        Args:
+            latent (Tensor): ``[F, ..., L]``, or ``[1, ..., L]`` where all heads start from the same latent.
+            action (Tensor): broadcastable to ``[F, ..., A]``.
+
+        Returns:
+            Tensor: ``[F, ..., L]``.
+        """
+        return self.dynamics(latent, action)
+
+    def reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Expected reward of ``action [..., A]`` in ``latent [..., L]``, shape ``[...]``."""
+        return two_hot_decode(self.reward_head(latent, action), self.bins)
+
+    def values(self, latent: Tensor) -> Tensor:
+        """Expected value of ``latent [..., L]`` by each value head, shape ``[..., V]``; never with dropout."""
+        return two_hot_decode(self.value_head(latent), self.bins).movedim(0, -1)
+
+    def termination(self, latent: Tensor) -> Tensor | None:
+        """Probability that the episode terminated on reaching ``latent [..., L]``, shape ``[...]``.
+
+        ``None`` without a termination head.
+        """
+        return None if self.termination_head is None else self.termination_head(latent).sigmoid()
+
+    def act(self, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None) -> Tensor:
+        """Samples the policy: ``clip(mean + std * noise, -1, 1)``, shape ``[..., A]``.
+
+        Args:
+            latent (Tensor): ``[..., L]``.
+            noise (Tensor): standard normal draws, ``[..., A]``.
+            log_std_bounds (tuple of float, optional): other bounds of the log std for this call.
+        """
+        mean, log_std = self.policy(latent, log_std_bounds)
+        return clipped_sample(mean, log_std.exp(), noise)

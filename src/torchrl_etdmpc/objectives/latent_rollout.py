@@ -1,0 +1,269 @@
+"""The latent rollout that all terms of the loss share, and the abstract loss that computes it."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torchrl_etdmpc.modules import WorldModel
+
+
+class Slices(NamedTuple):
+    """Replayed slices, time first. Fields that a loss does not read are ``None``."""
+
+    observation: Tensor
+    """First observation of each slice, ``[B, O]``."""
+    next_observation: Tensor
+    """``[T, B, O]``"""
+    action: Tensor
+    """``[T, B, A]``"""
+    reward: Tensor | None
+    """``[T, B]``"""
+    terminated: Tensor | None
+    """``[T, B]`` bool; entry k says whether step k *reached* a terminal state."""
+    plan_loc: Tensor | None
+    """``[T, B, A]``"""
+    plan_scale: Tensor | None
+    """``[T, B, A]``"""
+
+
+class LatentRollout(NamedTuple):
+    """Encoded and predicted latents of replayed slices."""
+
+    encoded: Tensor
+    """Encodings z_0..z_T of the real observations, without gradient, ``[T + 1, B, L]``."""
+    predicted: Tensor
+    """Head i's own rollout zhat_0..zhat_T of the replayed actions, with gradient, ``[T + 1, F, B, L]``."""
+
+
+def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
+    """Encodes every observation and rolls every dynamics head from the first one (spec of BMPC; thesis appendix B).
+
+    ``zhat_{0,i} = h(s_0)`` with gradient into the encoder, ``zhat_{k+1,i} = f_i(zhat_{k,i}, a_k)``; the encodings of
+    the later observations carry no gradient.
+
+    Args:
+        world_model (WorldModel): encoder and dynamics.
+        slices (Slices): T transitions of B slices.
+
+    Returns:
+        LatentRollout: ``[T + 1, B, L]`` and ``[T + 1, F, B, L]``.
+    """
+    first = world_model.encode(slices.observation)
+    with torch.no_grad():
+        later = world_model.encode(slices.next_observation)
+    latents = [first.expand(world_model.num_dynamics, *first.shape)]
+    for action in slices.action.unbind(0):
+        latents.append(world_model.next(latents[-1], action))
+    return LatentRollout(torch.cat([first.detach().unsqueeze(0), later]), torch.stack(latents))
+
+
+class LatentRolloutLoss(LossModule):
+    """Base of the losses that train a :class:`~torchrl_etdmpc.modules.WorldModel` on replayed slices.
+
+    A subclass names the networks it trains, the keys it reads and the terms it returns. Every term is weighted once, by
+    the coefficient buffer ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are.
+
+    Networks stay shared with the world model that was passed: the planner that holds it sees every update.
+    """
+
+    # TorchRL sums every entry that starts with "loss_" (its Trainer does, and so do users), so the entries must carry
+    # their weight; the unweighted values are the metrics that end in "_error" or "_kl".
+
+    @dataclass
+    class _AcceptedKeys:
+        """Configurable tensordict keys.
+
+        Attributes:
+            observation (NestedKey): flat observation ``[B, T, O]``; its successor is read at ``("next", observation)``.
+            action (NestedKey): replayed action ``[B, T, A]`` in [-1, 1].
+            reward (NestedKey): read at ``("next", reward)``, ``[B, T, 1]``.
+            terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head.
+            plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
+            plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``.
+        """
+
+        observation: NestedKey = "observation"
+        action: NestedKey = "action"
+        reward: NestedKey = "reward"
+        terminated: NestedKey = "terminated"
+        plan_loc: NestedKey = ("plan", "loc")
+        plan_scale: NestedKey = ("plan", "scale")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = None
+
+    encoder: nn.Module
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    dynamics: nn.Module
+    dynamics_params: TensorDictParams
+    target_dynamics_params: TensorDictParams
+    reward: nn.Module
+    reward_params: TensorDictParams
+    target_reward_params: TensorDictParams
+    value: nn.Module
+    value_params: TensorDictParams
+    target_value_params: TensorDictParams
+    termination: nn.Module
+    termination_params: TensorDictParams
+    target_termination_params: TensorDictParams
+    policy: nn.Module
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+
+    _attributes: ClassVar[dict[str, str]] = {
+        "encoder": "encoder",
+        "dynamics": "dynamics",
+        "reward": "reward_head",
+        "value": "value_head",
+        "termination": "termination_head",
+        "policy": "policy",
+    }
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        *,
+        networks: tuple[str, ...],
+        coefficients: dict[str, float],
+        rho: float,
+        reduction: str | None,
+    ) -> None:
+        super().__init__()
+        self._in_keys = None
+        self._out_keys = None
+        self.reduction = "mean" if reduction is None else reduction
+        if self.reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
+        if not 0 < rho <= 1:
+            raise ValueError(f"rho must be in (0, 1], got {rho}.")
+        for name in networks:
+            module = getattr(world_model, self._attributes[name])
+            if module is not None:
+                self.convert_to_functional(module, name, create_target_params=name == "value")
+        self.__dict__["world_model"] = world_model
+        for term, coefficient in coefficients.items():
+            self.register_coeff_buffer(f"{term}_coef", float(coefficient))
+        self.register_buffer("rho", torch.tensor(float(rho)))
+
+    def _apply(self, fn, *args, **kwargs):
+        # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
+        super()._apply(fn, *args, **kwargs)
+        self.__dict__["world_model"]._apply(fn)
+        return self
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        self._in_keys = None  # a new name for a key changes what dispatch expects
+
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights; target parameters become copies of the new ones."""
+        super().reset_parameters_recursive()
+        for name, target in self._modules.items():
+            if name.startswith("target_"):
+                target.data.update_(self._modules[name.removeprefix("target_")].data)
+
+    @property
+    @abc.abstractmethod
+    def _reads(self) -> tuple[str, ...]:
+        """Names of the accepted keys that this loss reads."""
+
+    @property
+    @abc.abstractmethod
+    def _term_names(self) -> tuple[str, ...]:
+        """Names of the terms, in order."""
+
+    @property
+    @abc.abstractmethod
+    def _metric_names(self) -> tuple[str, ...]:
+        """Names of the detached metrics, in order."""
+
+    @abc.abstractmethod
+    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Unreduced terms ``[T, B]`` by name, and scalar metrics by name."""
+
+    def _key(self, name: str) -> NestedKey:
+        key = getattr(self.tensor_keys, name.removeprefix("next_"))
+        return unravel_key(("next", key)) if name in ("next_observation", "reward", "terminated") else unravel_key(key)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that ``forward`` reads."""
+        if self._in_keys is None:
+            self._in_keys = [self._key(name) for name in self._reads]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys that ``forward`` returns: the ``loss_*`` terms, then the metrics."""
+        if self._out_keys is None:
+            return [f"loss_{name}" for name in self._term_names] + list(self._metric_names)
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, keys: list[str]) -> None:
+        self._out_keys = keys
+
+    def _slices(self, tensordict: TensorDictBase) -> Slices:
+        if tensordict.ndim != 2:
+            raise ValueError(
+                f"{type(self).__name__} needs a batch of slices [B, T], got batch size {list(tensordict.batch_size)}; "
+                "reshape a flat replay sample with sample.reshape(-1, slice_len)."
+            )
+        fields = dict.fromkeys(Slices._fields)
+        for name in self._reads:
+            value = tensordict.get(self._key(name), None)
+            if value is None:
+                raise KeyError(
+                    f"{type(self).__name__} needs the key {self._key(name)!r} in its input; rename it with "
+                    f"loss.set_keys({name.removeprefix('next_')}=...) or store it in the replay buffer."
+                )
+            fields[name] = value.transpose(0, 1)
+        fields["observation"] = fields["observation"][0]
+        for name in ("reward", "terminated"):
+            if fields[name] is not None:
+                fields[name] = fields[name].squeeze(-1)
+        return Slices(**fields)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the terms on a batch of slices.
+
+        Args:
+            tensordict (TensorDictBase): slices of T consecutive transitions of one episode each, batch size [B, T].
+
+        Returns:
+            TensorDictBase: ``loss_*`` entries (scalars, or ``[B, T]`` with ``reduction="none"``), weighted by their
+            coefficients and by ``rho^k`` at step k, and detached scalar metrics.
+
+        Raises:
+            ValueError: if the batch size is not [B, T].
+            KeyError: if a key is missing.
+        """
+        slices = self._slices(tensordict)
+        terms, metrics = self._terms(slices, latent_rollout(self.__dict__["world_model"], slices))
+        out = {
+            f"loss_{name}": getattr(self, f"{name}_coef") * self._reduce_loss(term.transpose(0, 1), tensordict)
+            for name, term in terms.items()
+        }
+        out.update({name: metric.detach() for name, metric in metrics.items()})
+        out = TensorDict(out, batch_size=[])
+        self._clear_weakrefs(tensordict, out)
+        return out
+
+    def _discount_depth(self, error: Tensor) -> Tensor:
+        """Weights ``[T, ...]`` errors by ``rho^k``."""
+        powers = self.rho ** torch.arange(error.shape[0], device=error.device, dtype=error.dtype)
+        return error * powers.view(-1, *(1,) * (error.ndim - 1))

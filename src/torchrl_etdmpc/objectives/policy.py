@@ -1,0 +1,146 @@
+"""The policy loss: distillation of the planner's Gaussian into the policy."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+
+KLDirection = Literal["backward", "forward"]
+
+
+class Distillation(NamedTuple):
+    """Divergence from the planner's target and entropy of the policy."""
+
+    kl: Tensor
+    """Mean over action dimensions, ``[T, F, B]``."""
+    entropy: Tensor
+    """Entropy of the (unclipped) policy, sum over action dimensions, ``[T, F, B]``."""
+
+
+def distillation(
+    world_model: WorldModel,
+    latent: Tensor,
+    plan_loc: Tensor,
+    plan_scale: Tensor,
+    *,
+    kl_direction: KLDirection = "backward",
+) -> Distillation:
+    """KL between the policy and the planner's target, in closed form (thesis Eq. 2.17).
+
+    ``"backward"`` is ``KL(pi || plan)``, which BMPC's code uses; ``"forward"`` is ``KL(plan || pi)``.
+
+    Args:
+        world_model (WorldModel): the policy.
+        latent (Tensor): latents, detached here, shape ``[T, F, B, L]``.
+        plan_loc (Tensor): mean of the target, shape ``[T, B, A]``.
+        plan_scale (Tensor): standard deviation of the target, shape ``[T, B, A]``.
+        kl_direction (str): ``"backward"`` or ``"forward"``.
+
+    Returns:
+        Distillation: KL and entropy, each ``[T, F, B]``.
+    """
+    mean, log_std = world_model.policy(latent.detach())
+    policy = (mean, log_std.exp())
+    plan = (plan_loc.unsqueeze(1), plan_scale.unsqueeze(1))
+    kl = gaussian_kl(*policy, *plan) if kl_direction == "backward" else gaussian_kl(*plan, *policy)
+    return Distillation(kl.mean(-1), gaussian_entropy(log_std).sum(-1))
+
+
+class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
+    """Distils the planner into the policy (thesis Eq. 2.17; BMPC, arXiv:2503.18871).
+
+    On the detached rollout latents, ``KL(pi || plan) / S - entropy_coef * entropy * A`` with the KL averaged over action
+    dimensions; S is a running scale of the KL (5th to 95th percentile at k = 0, never below 1), moved only in training
+    mode. Trains the policy alone.
+
+    Args:
+        world_model (WorldModel): the networks, shared with the caller.
+
+    Keyword Args:
+        entropy_coef (float): weight of the entropy. Default: 1e-4.
+        policy_coef (float): weight of the whole term. Default: 1.
+        scale_tau (float): rate of the running scale, in [0, 1]. Default: 0.01.
+        kl_direction (str): ``"backward"`` (default) or ``"forward"``.
+        rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
+
+    Raises:
+        ValueError: if an argument is out of range.
+
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> loss = EfficientTDMPCPolicyLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
+    >>> sorted(loss(random_slices(3, 2)).keys())
+    ['kl_scale', 'loss_policy', 'policy_entropy', 'policy_kl']
+    """
+
+    _schedulable_buffers = frozenset({"entropy_coef", "policy_coef"})
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        *,
+        entropy_coef: float = 1e-4,
+        policy_coef: float = 1.0,
+        scale_tau: float = 0.01,
+        kl_direction: KLDirection = "backward",
+        rho: float = 0.5,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(
+            world_model,
+            networks=("policy",),
+            coefficients={"policy": policy_coef, "entropy": entropy_coef},
+            rho=rho,
+            reduction=reduction,
+        )
+        register_running_scale(self, scale_tau, kl_direction)
+
+    @property
+    def _reads(self) -> tuple[str, ...]:
+        return ("observation", "next_observation", "action", "plan_loc", "plan_scale")
+
+    @property
+    def _term_names(self) -> tuple[str, ...]:
+        return ("policy",)
+
+    @property
+    def _metric_names(self) -> tuple[str, ...]:
+        return ("policy_kl", "policy_entropy", "kl_scale")
+
+    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        return policy_terms(self, slices, rollout)
+
+
+def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_direction: str) -> None:
+    """Checks the options of the distillation and registers its running scale on the loss."""
+    if not 0 <= scale_tau <= 1:
+        raise ValueError(f"scale_tau must be in [0, 1], got {scale_tau}.")
+    if kl_direction not in ("backward", "forward"):
+        raise ValueError(f"kl_direction must be 'backward' or 'forward', got {kl_direction!r}.")
+    loss.scale_tau = scale_tau
+    loss.kl_direction = kl_direction
+    loss.register_buffer("kl_scale", torch.ones(()))
+
+
+def policy_terms(
+    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Term ``[T, B]`` and metrics of the policy, for any loss with a running scale."""
+    kl, entropy = distillation(
+        loss.world_model,
+        rollout.predicted[:-1],
+        slices.plan_loc,
+        slices.plan_scale,
+        kl_direction=loss.kl_direction,
+    )
+    if loss.training:
+        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau))
+    term = kl / loss.kl_scale - loss.entropy_coef * slices.action.shape[-1] * entropy
+    metrics = {"policy_kl": kl.mean(), "policy_entropy": entropy.mean(), "kl_scale": loss.kl_scale.clone()}
+    return {"policy": loss._discount_depth(term.mean(1))}, metrics

@@ -1,0 +1,148 @@
+"""The value loss: one-step imagined targets from encoded latents, read on every head's rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+
+
+@torch.no_grad()
+def imagined_value_target(
+    world_model: WorldModel,
+    target_values: Callable[[Tensor], Tensor],
+    latent: Tensor,
+    noise: Tensor,
+    discount: float | Tensor,
+) -> Tensor:
+    """One-step imagined TD target at encoded latents (thesis Eq. 2.16, and 3.2 with H = 1).
+
+    ``y = R(z, a) + gamma mean_{i,j} (1 - p(f_i(z, a))) Vbar_j(f_i(z, a))``, ``a ~ pi(z)``; p is the predicted probability
+    of termination, 0 without a termination head.
+
+    Args:
+        world_model (WorldModel): policy, reward and dynamics.
+        target_values (callable): the target value heads, latents ``[..., L]`` to values ``[..., V]``.
+        latent (Tensor): encoded latents z, shape ``[..., L]``.
+        noise (Tensor): standard normal draws for the policy's action, shape ``[..., A]``.
+        discount (float or Tensor): gamma.
+
+    Returns:
+        Tensor: targets in the units of the return, without gradient, shape ``[...]``.
+    """
+    action = world_model.act(latent, noise)
+    imagined = world_model.next(latent.unsqueeze(0), action)
+    bootstrap = target_values(imagined).mean(-1)
+    ended = world_model.termination(imagined)
+    if ended is not None:
+        bootstrap = bootstrap * (1 - ended)
+    return world_model.reward(latent, action) + discount * bootstrap.mean(0)
+
+
+def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor, *, dropout: bool) -> Tensor:
+    """Cross-entropy of every value head on every dynamics head's rollout, ``CE(V_j(zhat_{k,i}), y_k)``.
+
+    Args:
+        world_model (WorldModel): the value heads.
+        rollout (LatentRollout): T steps of F heads.
+        target (Tensor): y, shape ``[T, B]``.
+        dropout (bool): whether the value heads use dropout.
+
+    Returns:
+        Tensor: mean over value and dynamics heads, shape ``[T, B]``.
+    """
+    logits = world_model.value_head(rollout.predicted[:-1], dropout=dropout)  # [V, T, F, B, M]
+    return two_hot_cross_entropy(logits, target.unsqueeze(1), world_model.bins).mean((0, 2))
+
+
+class EfficientTDMPCValueLoss(LatentRolloutLoss):
+    """Value loss with one-step imagined targets (thesis Eq. 2.16; BMPC, arXiv:2503.18871).
+
+    Trains the value heads, and encoder and dynamics through the rollout. The target heads are an exponential moving
+    average: pass this loss to :class:`torchrl.objectives.SoftUpdate` (``tau=0.01``) and step it after every update.
+
+    Args:
+        world_model (WorldModel): the networks, shared with the caller.
+
+    Keyword Args:
+        discount (float): gamma, in (0, 1].
+        value_coef (float): weight of the term. Default: 0.1.
+        rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
+
+    Raises:
+        ValueError: if an argument is out of range.
+
+    >>> from torchrl.objectives import SoftUpdate
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> loss = EfficientTDMPCValueLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=32), discount=0.99)
+    >>> updater = SoftUpdate(loss, tau=0.01)
+    >>> sorted(loss(random_slices(3, 2)).keys())
+    ['loss_value', 'value_error', 'value_target']
+    """
+
+    _schedulable_buffers = frozenset({"value_coef", "discount"})
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        *,
+        discount: float,
+        value_coef: float = 0.1,
+        rho: float = 0.5,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(
+            world_model,
+            networks=("encoder", "dynamics", "value"),
+            coefficients={"value": value_coef},
+            rho=rho,
+            reduction=reduction,
+        )
+        register_discount(self, discount)
+
+    @property
+    def _reads(self) -> tuple[str, ...]:
+        return ("observation", "next_observation", "action")
+
+    @property
+    def _term_names(self) -> tuple[str, ...]:
+        return ("value",)
+
+    @property
+    def _metric_names(self) -> tuple[str, ...]:
+        return ("value_error", "value_target")
+
+    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        return value_terms(self, slices, rollout)
+
+
+def register_discount(loss: LatentRolloutLoss, discount: float) -> None:
+    """Checks the discount and registers it as a buffer of the loss."""
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
+    loss.register_coeff_buffer("discount", float(discount))
+
+
+def value_terms(
+    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Term ``[T, B]`` and metrics of the value heads, for any loss that owns target value parameters."""
+    world_model = loss.world_model
+
+    def target_values(latent: Tensor) -> Tensor:
+        with loss.target_value_params.to_module(loss.value):
+            logits = loss.value(latent)
+        return two_hot_decode(logits, world_model.bins).movedim(0, -1)
+
+    # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
+    target = imagined_value_target(
+        world_model, target_values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
+    )
+    error = value_error(world_model, rollout, target, dropout=loss.training)
+    return {"value": loss._discount_depth(error)}, {"value_error": error.mean(), "value_target": target.mean()}

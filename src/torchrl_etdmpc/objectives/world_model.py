@@ -1,0 +1,138 @@
+"""Consistency, reward and termination: the terms that teach the world model to predict."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchrl_etdmpc.functional import two_hot_cross_entropy
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+
+
+def consistency_error(rollout: LatentRollout) -> Tensor:
+    """Squared distance between each head's prediction and the encoding, ``(zhat_{k+1,i} - sg(z_{k+1}))^2``.
+
+    Thesis Eq. 2.11 and appendix B.
+
+    Args:
+        rollout (LatentRollout): T steps of F heads.
+
+    Returns:
+        Tensor: mean over latent dimensions and heads, shape ``[T, B]``.
+    """
+    return (rollout.predicted[1:] - rollout.encoded[1:].unsqueeze(1)).square().mean(-1).mean(1)
+
+
+def reward_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices) -> Tensor:
+    """Cross-entropy of the reward read on every head's own rollout, ``CE(R(zhat_{k,i}, a_k), r_k)``.
+
+    Thesis Eq. 2.12 and appendix B.
+
+    Args:
+        world_model (WorldModel): the reward head.
+        rollout (LatentRollout): T steps of F heads.
+        slices (Slices): the replayed actions and rewards.
+
+    Returns:
+        Tensor: mean over heads, shape ``[T, B]``.
+    """
+    logits = world_model.reward_head(rollout.predicted[:-1], slices.action.unsqueeze(1))
+    return two_hot_cross_entropy(logits, slices.reward.unsqueeze(1), world_model.bins).mean(1)
+
+
+def termination_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices) -> Tensor:
+    """Binary cross-entropy of the termination that step k reached, read at ``zhat_{k+1,i}``.
+
+    Args:
+        world_model (WorldModel): the termination head.
+        rollout (LatentRollout): T steps of F heads.
+        slices (Slices): the replayed flags.
+
+    Returns:
+        Tensor: mean over heads, shape ``[T, B]``.
+    """
+    logits = world_model.termination_head(rollout.predicted[1:])
+    flags = slices.terminated.unsqueeze(1).expand_as(logits).to(logits.dtype)
+    return F.binary_cross_entropy_with_logits(logits, flags, reduction="none").mean(1)
+
+
+class EfficientTDMPCModelLoss(LatentRolloutLoss):
+    """Latent consistency, reward and (with a termination head) termination loss.
+
+    Thesis Eq. 2.11 and 2.12, on every dynamics head's own rollout (appendix B). Trains encoder, dynamics, reward and
+    termination heads.
+
+    Args:
+        world_model (WorldModel): the networks, shared with the caller.
+
+    Keyword Args:
+        consistency_coef (float): weight of the consistency term. Default: 20.
+        reward_coef (float): weight of the reward term. Default: 0.1.
+        termination_coef (float): weight of the termination term. Default: 1.
+        rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5. The termination term is not
+            decayed: a terminal state is always the last of its slice, so a decay would bias the predicted probability.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
+
+    Raises:
+        ValueError: if an argument is out of range.
+
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> sorted(EfficientTDMPCModelLoss(world_model)(random_slices(3, 2)).keys())
+    ['consistency_error', 'loss_consistency', 'loss_reward', 'reward_error']
+    """
+
+    _schedulable_buffers = frozenset({"consistency_coef", "reward_coef", "termination_coef"})
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        *,
+        consistency_coef: float = 20.0,
+        reward_coef: float = 0.1,
+        termination_coef: float = 1.0,
+        rho: float = 0.5,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(
+            world_model,
+            networks=("encoder", "dynamics", "reward", "termination"),
+            coefficients={
+                "consistency": consistency_coef,
+                "reward": reward_coef,
+                **({} if world_model.termination_head is None else {"termination": termination_coef}),
+            },
+            rho=rho,
+            reduction=reduction,
+        )
+
+    @property
+    def _reads(self) -> tuple[str, ...]:
+        flags = () if self.world_model.termination_head is None else ("terminated",)
+        return ("observation", "next_observation", "action", "reward", *flags)
+
+    @property
+    def _term_names(self) -> tuple[str, ...]:
+        return ("consistency", "reward", *(() if self.world_model.termination_head is None else ("termination",)))
+
+    @property
+    def _metric_names(self) -> tuple[str, ...]:
+        return tuple(f"{name}_error" for name in self._term_names)
+
+    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        return model_terms(self, slices, rollout)
+
+
+def model_terms(
+    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Terms ``[T, B]`` and metrics of the world model, for any loss on a latent rollout."""
+    errors = {
+        "consistency": consistency_error(rollout),
+        "reward": reward_error(loss.world_model, rollout, slices),
+    }
+    terms = {name: loss._discount_depth(error) for name, error in errors.items()}
+    if loss.world_model.termination_head is not None:
+        terms["termination"] = errors["termination"] = termination_error(loss.world_model, rollout, slices)
+    return terms, {f"{name}_error": error.mean() for name, error in errors.items()}

@@ -1,0 +1,54 @@
+"""What goes into a plan and what comes out: frozen containers with a shape per field."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class PlanNoise(NamedTuple):
+    """Every random number of one planning call."""
+
+    proposals: Tensor
+    """Standard normal, ``[..., P, H, A]``."""
+    candidates: Tensor
+    """Standard normal, ``[..., I, N - P, H, A]``, one block per iteration."""
+    elite: Tensor
+    """Uniform on [0, 1), ``[..., K]``: picks the elite."""
+    action: Tensor
+    """Standard normal, ``[..., A]``: the exploration of a training action."""
+
+
+class PlanTrace(NamedTuple):
+    """Every iteration of a planning call, for inspection."""
+
+    actions: Tensor
+    """Candidates, the policy's proposals first, ``[..., I, N, H, A]``."""
+    scores: Tensor
+    """``[..., I, N]``"""
+    returns: Tensor
+    """Return table, ``[..., I, N, D, F, V]``."""
+    mean: Tensor
+    """Mean after each iteration, ``[..., I, H, A]``."""
+    std: Tensor
+    """Standard deviation after each iteration, ``[..., I, H, A]``."""
+
+
+class Plan(NamedTuple):
+    """Result of a planning call."""
+
+    action: Tensor
+    """Action to take: a sample in training, ``loc`` in evaluation, ``[..., A]``."""
+    loc: Tensor
+    """Mean of the policy target, ``[..., A]``."""
+    scale: Tensor
+    """Standard deviation of the policy target, ``[..., A]``."""
+    value: Tensor
+    """Score of the chosen sequence (elite-weighted score with ``first_action="mean"``), ``[...]``; NaN on fallback."""
+    mean: Tensor
+    """Mean of the last iteration, the next call's warm start, ``[..., H, A]``."""
+    fallback: Tensor
+    """Whether no candidate of the last iteration had a finite score, so that the policy acted instead, ``[...]``."""
+    trace: PlanTrace | None
+    """Every iteration, if asked for."""

@@ -1,0 +1,167 @@
+"""Reanalyze: fresh planner targets for replayed states, written back to the buffer."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor, nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import ExplorationType, Transform
+from torchrl.envs.utils import set_exploration_type
+
+TARGETS = ("loc", "scale", "value", "version")
+
+
+class ReanalyzeTransform(Transform):
+    """Re-plans part of every ``interval``-th sample and refreshes its targets in the batch and in the buffer.
+
+    The states of the first ``num_slices`` slices of the sample are planned in one batched call with the current
+    networks (thesis 2.4 and 3.4.3; BMPC). The new targets replace those in the sample that is about to be trained on
+    and, through the buffer's generation-checked update, those in the buffer: a row that was overwritten in the meantime
+    is left alone and counted as stale. A row that the slices share is given one target.
+
+    The planner is any TensorDict module that reads an observation and writes the targets below ``plan_key``; it is
+    called in the exploring mode and without a warm start.
+
+    Args:
+        planner (nn.Module): e.g. :class:`~torchrl_etdmpc.planners.EnsembleMPPIPlanner` with ``warm_start=False``.
+
+    Keyword Args:
+        slice_len (int): T, rows per slice of the sample.
+        interval (int): every how many samples to re-plan. With U updates per decision step and one reanalyze every k
+            decision steps this is U k.
+        num_slices (int): slices to re-plan; all of them if the sample has fewer. Default: 20.
+        observation_key (NestedKey): Default: ``"observation"``.
+        plan_key (NestedKey): root of ``loc``, ``scale``, ``value`` and ``version``. Default: ``"plan"``.
+
+    Attributes:
+        enabled (bool): whether samples are re-planned; pretraining on random data turns it off.
+        refreshed (int): rows whose target was renewed in the buffer, so far.
+        stale (int): rows that had been overwritten before their new target arrived, so far.
+        target_age (Tensor): mean age, in updates, of the targets of the last sample before it was refreshed.
+
+    Raises:
+        ValueError: if an argument is out of range.
+
+    >>> from torchrl.data import LazyTensorStorage, TensorDictRoundRobinWriter
+    >>> from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, StepSliceSampler, WorldModel
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(WorldModel(3, 2)), horizon=3, warm_start=False)
+    >>> buffer = TensorDictReplayBuffer(
+    ...     storage=LazyTensorStorage(100), sampler=StepSliceSampler(3),
+    ...     writer=TensorDictRoundRobinWriter(track_generations=True), batch_size=12)
+    >>> reanalyze = ReanalyzeTransform(planner, slice_len=3, interval=10).attach(buffer)
+    """
+
+    def __init__(
+        self,
+        planner: nn.Module,
+        *,
+        slice_len: int,
+        interval: int,
+        num_slices: int = 20,
+        observation_key: NestedKey = "observation",
+        plan_key: NestedKey = "plan",
+    ) -> None:
+        for name, number in {"slice_len": slice_len, "interval": interval, "num_slices": num_slices}.items():
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1, got {number}.")
+        super().__init__()
+        # Outside the module tree: the buffer's state must not contain the planner, nor the transform the buffer.
+        self.__dict__["planner"] = planner
+        self.__dict__["replay_buffer"] = None
+        self.slice_len = slice_len
+        self.interval = interval
+        self.num_slices = num_slices
+        self.observation_key = unravel_key(observation_key)
+        self.plan_keys = {name: unravel_key((plan_key, name)) for name in TARGETS}
+        self.enabled = True
+        self.samples = 0
+        self.refreshed = 0
+        self.stale = 0
+        self.target_age: Tensor | None = None
+
+    def attach(self, replay_buffer: TensorDictReplayBuffer) -> ReanalyzeTransform:
+        """Appends the transform to a buffer, after checking that the buffer can take the write-back.
+
+        Args:
+            replay_buffer (TensorDictReplayBuffer): with ``TensorDictRoundRobinWriter(track_generations=True)`` and no
+                prefetching.
+
+        Returns:
+            ReanalyzeTransform: itself.
+
+        Raises:
+            ValueError: if the buffer's writer does not track generations, or the buffer prefetches.
+        """
+        if not getattr(replay_buffer.writer, "tracks_generations", False):
+            raise ValueError(
+                "reanalyze writes back to the buffer and must know whether a row was overwritten; build the buffer with "
+                "writer=TensorDictRoundRobinWriter(track_generations=True)."
+            )
+        if getattr(replay_buffer, "_prefetch", False):
+            raise ValueError(
+                "reanalyze runs the planner inside sample(), which a prefetching buffer would do in a thread beside the "
+                "optimiser; build the buffer without prefetch."
+            )
+        self.__dict__["replay_buffer"] = replay_buffer
+        replay_buffer.append_transform(self)
+        return self
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Called on every sample ``[B * T]``; re-plans it if it is its turn."""
+        if not self.enabled:
+            return tensordict
+        self.samples += 1
+        if self.samples % self.interval:
+            return tensordict
+        return self.refresh(tensordict)
+
+    @torch.no_grad()
+    def refresh(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Re-plans the first slices of a sample now, whatever the interval.
+
+        Args:
+            tensordict (TensorDictBase): a sample of the attached buffer, batch size [B * T], with ``index``. With
+                ``index_generation`` (present in what ``buffer.sample()`` returned) a row that was overwritten since is
+                recognised; without it, a row that is overwritten during the planning.
+
+        Returns:
+            TensorDictBase: the sample with its targets refreshed.
+
+        Raises:
+            RuntimeError: if the transform is not attached to a buffer.
+            KeyError: if the sample lacks the targets or the index.
+        """
+        buffer = self.replay_buffer
+        if buffer is None:
+            raise RuntimeError("ReanalyzeTransform has no buffer to write to; use reanalyze.attach(replay_buffer).")
+        index = tensordict.get("index", None)
+        missing = [key for key in self.plan_keys.values() if tensordict.get(key, None) is None]
+        if index is None or missing:
+            raise KeyError(
+                f"reanalyze needs 'index' and {', '.join(map(repr, self.plan_keys.values()))} in the sample; use a "
+                "TensorDictReplayBuffer whose rows hold planner targets from the first one on."
+            )
+        rows = min(self.num_slices * self.slice_len, tensordict.batch_size[0])
+        index = index.reshape(tensordict.batch_size[0], -1)[:rows, 0]
+        generation = tensordict.get("index_generation", None)
+        generation = buffer.writer.generations_of(index) if generation is None else generation.reshape(-1)[:rows]
+
+        # Fixed shapes: duplicates are planned too, but every copy of a row takes the first copy's target.
+        copies = index.unsqueeze(0) == index.unsqueeze(1)
+        original = copies.to(torch.uint8).argmax(1)
+        states = TensorDict({self.observation_key: tensordict.get(self.observation_key)[:rows]}, [rows])
+        with set_exploration_type(ExplorationType.RANDOM):
+            planned = self.planner(states)
+        age = planned.get(self.plan_keys["version"]) - tensordict.get(self.plan_keys["version"])[:rows]
+        self.target_age = age.float().mean()
+        patch = {key: planned.get(key)[original.to(planned.get(key).device)] for key in self.plan_keys.values()}
+        result = buffer.update_if_present(index=index, generation=generation, patch=patch)
+        self.refreshed += result.updated_count
+        self.stale += result.stale_count
+        for key, value in patch.items():
+            stored = tensordict.get(key).clone()
+            stored[:rows] = value.to(stored.device)
+            tensordict.set(key, stored)
+        # Rows beyond the first slices may be copies of re-planned ones; they keep their old target in this batch.
+        return tensordict

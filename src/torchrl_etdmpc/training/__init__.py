@@ -1,0 +1,52 @@
+"""Training: configuration, assembly, updates, evaluation, checkpoints and logs."""
+
+from torchrl_etdmpc.training.builders import (
+    Agent,
+    build_agent,
+    build_collector,
+    build_planner,
+    build_reanalyze,
+    build_replay,
+    build_world_model,
+    resolve_compile,
+    resolve_device,
+)
+from torchrl_etdmpc.training.checkpoint import CheckpointError, load_agent, read_checkpoint, save_checkpoint
+from torchrl_etdmpc.training.command_line import hydra_main, one_line_errors
+from torchrl_etdmpc.training.config import PRESETS, TrainConfig, preset
+from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
+from torchrl_etdmpc.training.progress import progress_bar
+from torchrl_etdmpc.training.run_log import RunLog, library_versions, plot_curve
+from torchrl_etdmpc.training.train import TrainingRun
+from torchrl_etdmpc.training.updater import Updater
+from torchrl_etdmpc.training.video import write_mp4
+
+__all__ = [
+    "PRESETS",
+    "Agent",
+    "BarePolicy",
+    "CheckpointError",
+    "RunLog",
+    "TrainConfig",
+    "TrainingRun",
+    "Updater",
+    "build_agent",
+    "build_collector",
+    "build_planner",
+    "build_reanalyze",
+    "build_replay",
+    "build_world_model",
+    "evaluate",
+    "hydra_main",
+    "library_versions",
+    "load_agent",
+    "one_line_errors",
+    "plot_curve",
+    "preset",
+    "progress_bar",
+    "read_checkpoint",
+    "resolve_compile",
+    "resolve_device",
+    "save_checkpoint",
+    "write_mp4",
+]

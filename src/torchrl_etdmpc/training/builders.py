@@ -1,0 +1,208 @@
+"""From a configuration to the parts of an agent."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
+
+from torchrl_etdmpc.collectors import SeedPolicy, StepCollector
+from torchrl_etdmpc.envs import LatentEnv
+from torchrl_etdmpc.functional import discount_from_episode_length
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner
+from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
+from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig
+from torchrl_etdmpc.training.updater import Updater
+
+
+@dataclass(frozen=True)
+class Agent:
+    """The parts that learn and act; all of them share one world model."""
+
+    world_model: WorldModel
+    planner: EnsembleMPPIPlanner
+    reanalyze_planner: EnsembleMPPIPlanner
+    loss: EfficientTDMPCLoss
+    updater: Updater
+
+
+def resolve_device(name: str) -> torch.device:
+    """The device behind ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Raises:
+        ValueError: if CUDA is asked for and not there.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(name)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto.")
+    return device
+
+
+def resolve_compile(setting: str, device: torch.device) -> str | None:
+    """The ``torch.compile`` mode of ``auto``, ``off`` or ``default``; ``None`` is eager.
+
+    ``auto`` compiles where a compiler exists: always on CUDA, on a CPU if there is a C++ compiler. It warns once if not.
+    """
+    if setting == "off":
+        return None
+    if setting == "auto" and device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
+        warnings.warn("no C++ compiler found, so nothing is compiled and training is slower; install g++.", stacklevel=2)
+        return None
+    return "default"
+
+
+def build_world_model(config: ModelConfig, observation_dim: int, action_dim: int) -> WorldModel:
+    """The networks for an environment's sizes."""
+    return WorldModel(
+        observation_dim,
+        action_dim,
+        latent_dim=config.latent_dim,
+        mlp_dim=config.mlp_dim,
+        encoder_dim=config.encoder_dim,
+        encoder_layers=config.encoder_layers,
+        num_dynamics=config.num_dynamics,
+        num_values=config.num_values,
+        simnorm_dim=config.simnorm_dim,
+        num_bins=config.num_bins,
+        bin_range=(config.bin_min, config.bin_max),
+        dropout=config.dropout,
+        log_std_bounds=(config.log_std_min, config.log_std_max),
+        activation=config.activation,
+        termination=config.termination,
+    )
+
+
+def build_planner(
+    world_model: WorldModel,
+    config: PlannerConfig,
+    *,
+    discount: float,
+    warm_start: bool,
+    proposal_log_std_bounds: tuple[float, float] | None = None,
+    compile_mode: str | None = None,
+) -> EnsembleMPPIPlanner:
+    """A planner on shared networks; ``compile_mode`` compiles its ``plan``."""
+    planner = EnsembleMPPIPlanner(
+        LatentEnv(world_model),
+        horizon=config.horizon,
+        num_samples=config.num_samples,
+        num_elites=config.num_elites,
+        num_proposals=config.num_proposals,
+        iterations=config.iterations,
+        extra_iterations=config.extra_iterations,
+        large_action_dim=config.large_action_dim,
+        score=config.score,
+        beta=config.beta,
+        discount=discount,
+        inverse_temperature=config.inverse_temperature,
+        std_min=config.std_min,
+        std_max=config.std_max,
+        first_action=config.first_action,
+        eval_first_action=config.eval_first_action,
+        warm_start=warm_start,
+        proposal_log_std_bounds=proposal_log_std_bounds,
+    )
+    if compile_mode is not None:
+        planner.plan = torch.compile(planner.plan, mode=compile_mode, dynamic=False, fullgraph=True)
+    return planner
+
+
+def build_agent(config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu") -> Agent:
+    """World model, both planners, loss and updater.
+
+    Args:
+        config (TrainConfig): the run.
+        observation_dim (int): O.
+        action_dim (int): A.
+        device (torch.device or str): where the networks live. Default: ``"cpu"``.
+    """
+    device = torch.device(device)
+    compile_mode = resolve_compile(config.compile, device)
+    discount = config.loss.discount
+    if discount is None:
+        discount = discount_from_episode_length(config.task_spec.decision_steps_per_episode)
+    world_model = build_world_model(config.model, observation_dim, action_dim).to(device)
+    loss = EfficientTDMPCLoss(
+        world_model,
+        discount=discount,
+        consistency_coef=config.loss.consistency_coef,
+        reward_coef=config.loss.reward_coef,
+        value_coef=config.loss.value_coef,
+        termination_coef=config.loss.termination_coef,
+        entropy_coef=config.loss.entropy_coef,
+        scale_tau=config.loss.tau,
+        kl_direction=config.loss.kl_direction,
+        rho=config.loss.rho,
+    )
+    updater = Updater(
+        loss,
+        lr=config.optim.lr,
+        encoder_lr_scale=config.optim.encoder_lr_scale,
+        grad_clip_norm=config.optim.grad_clip_norm,
+        tau=config.loss.tau,
+        compile_mode=compile_mode,
+    )
+    planner = build_planner(world_model, config.planner, discount=discount, warm_start=True, compile_mode=compile_mode)
+    reanalyze_planner = build_planner(
+        world_model,
+        config.reanalyze,
+        discount=discount,
+        warm_start=False,
+        proposal_log_std_bounds=(config.reanalyze.proposal_log_std_min, config.reanalyze.proposal_log_std_max),
+        compile_mode=compile_mode,
+    )
+    return Agent(world_model, planner, reanalyze_planner, loss, updater)
+
+
+def build_replay(config: TrainConfig, device: torch.device | str = "cpu") -> TensorDictReplayBuffer:
+    """The buffer: as many rows as the budget can fill, sampled by slices of ``loss.slice_len``.
+
+    Args:
+        config (TrainConfig): the run.
+        device (torch.device or str): the run's device, where batches go. Default: ``"cpu"``.
+    """
+    decisions = math.ceil(config.total_env_steps / config.task_spec.action_repeat) + config.num_envs
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(
+            min(config.replay.capacity, decisions), device=device if config.replay.device == "run" else "cpu"
+        ),
+        sampler=StepSliceSampler(config.loss.slice_len, uniform_over=config.replay.uniform_over),
+        writer=TensorDictRoundRobinWriter(track_generations=True),
+        batch_size=config.optim.batch_size * config.loss.slice_len,
+    )
+
+
+def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayBuffer) -> ReanalyzeTransform | None:
+    """Reanalyze attached to the buffer, or ``None`` if ``reanalyze.every`` is 0."""
+    if config.reanalyze.every == 0:
+        return None
+    reanalyze = ReanalyzeTransform(
+        agent.reanalyze_planner,
+        slice_len=config.loss.slice_len,
+        interval=config.reanalyze.every * config.optim.updates_per_decision,
+        num_slices=config.reanalyze.num_slices,
+    )
+    return reanalyze.attach(replay)
+
+
+def build_collector(config: TrainConfig, agent: Agent, env, replay: TensorDictReplayBuffer) -> StepCollector:
+    """The collector with its seed phase, on an environment with ``config.num_envs`` rows."""
+    return StepCollector(
+        env,
+        agent.planner,
+        replay_buffer=replay,
+        total_frames=math.ceil(config.total_env_steps / config.task_spec.action_repeat),
+        init_random_frames=config.seed_decisions,
+        seed_policy=SeedPolicy(env.action_spec),
+        insertion=config.replay.insertion,
+        exclude_keys=("plan_mean", ("next", "plan_mean"), "is_init", "episode_reward"),
+        policy_device=agent.world_model.bins.device,
+    )

@@ -1,0 +1,119 @@
+"""Checkpoints: weights, optimisers and counters in one file that holds no code."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_etdmpc.training.builders import Agent, build_agent
+from torchrl_etdmpc.training.config import TrainConfig
+
+FORMAT = 1
+
+
+class CheckpointError(RuntimeError):
+    """A file that cannot be used as a checkpoint, and why."""
+
+
+def save_checkpoint(path: str | Path, agent: Agent, config: TrainConfig, counters: dict[str, int | float]) -> Path:
+    """Writes weights, target weights, running scale, optimiser states, configuration and counters.
+
+    The file is written under a temporary name and moved into place, so a run that is cut off leaves no half file.
+
+    Args:
+        path (str or Path): where to; missing folders are made.
+        agent (Agent): what to save.
+        config (TrainConfig): the run.
+        counters (dict): e.g. env_steps, decision_steps, updates.
+
+    Returns:
+        Path: the file.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {
+        "format": FORMAT,
+        "config": config.to_dict(),
+        "observation_dim": agent.world_model.observation_dim,
+        "action_dim": agent.world_model.action_dim,
+        "world_model": agent.world_model.state_dict(),
+        "loss": agent.loss.state_dict(),  # shares its storage with the world model, so it is written once
+        "optimisers": agent.updater.state_dict(),
+        "counters": dict(counters),
+    }
+    temporary = path.with_name(path.name + ".tmp")
+    torch.save(content, temporary)
+    os.replace(temporary, path)
+    return path
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The content of a checkpoint; never runs code from the file (``weights_only=True``).
+
+    Raises:
+        CheckpointError: if the file is missing, is not a checkpoint or has another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path} is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt.")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, EOFError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path} is not a readable checkpoint ({reason[:120]}).") from error
+    if not isinstance(content, dict) or "format" not in content or "world_model" not in content:
+        raise CheckpointError(f"{path} is a PyTorch file but not a checkpoint of torchrl_etdmpc.")
+    if content["format"] != FORMAT:
+        raise CheckpointError(f"{path} has checkpoint format {content['format']}; this version reads format {FORMAT}.")
+    return content
+
+
+def load_agent(
+    path: str | Path,
+    *,
+    observation_dim: int | None = None,
+    action_dim: int | None = None,
+    device: torch.device | str = "cpu",
+    compile_setting: str | None = None,
+) -> tuple[Agent, TrainConfig, dict[str, int | float]]:
+    """Rebuilds the agent of a checkpoint.
+
+    Args:
+        path (str or Path): the checkpoint.
+        observation_dim (int, optional): O of the environment it is meant for; checked if given.
+        action_dim (int, optional): A of that environment; checked if given.
+        device (torch.device or str): where the networks go. Default: ``"cpu"``.
+        compile_setting (str, optional): overrides the run's ``compile``.
+
+    Returns:
+        tuple: agent, the run's configuration, the counters.
+
+    Raises:
+        CheckpointError: if the file cannot be used, or the sizes differ.
+    """
+    content = read_checkpoint(path)
+    saved = (content["observation_dim"], content["action_dim"])
+    wanted = (observation_dim or saved[0], action_dim or saved[1])
+    if saved != wanted:
+        raise CheckpointError(
+            f"{path} was trained with observation size {saved[0]} and action size {saved[1]}, the environment has "
+            f"{wanted[0]} and {wanted[1]}; use the task it was trained on ({content['config'].get('task')})."
+        )
+    values = dict(content["config"])
+    if compile_setting is not None:
+        values["compile"] = compile_setting
+    try:
+        config = TrainConfig.from_dict(values)
+        agent = build_agent(config, *saved, device=device)
+        agent.world_model.load_state_dict(content["world_model"])
+        agent.loss.load_state_dict(content["loss"])
+        agent.updater.load_state_dict(content["optimisers"])
+    except (RuntimeError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise CheckpointError(f"{path} does not fit its own configuration ({reason}).") from error
+    return agent, config, content["counters"]

@@ -1,0 +1,82 @@
+"""The command line of the examples: Hydra overrides on a preset, and errors in one line."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable
+
+from torchrl_etdmpc.training.config import PRESETS, TrainConfig, preset
+
+
+def one_line_errors(main: Callable[[], None]) -> Callable[[], None]:
+    """Makes a command end in one line on stderr and exit code 1 for any error that a user can mend.
+
+    ``TORCHRL_ETDMPC_TRACEBACK=1`` shows the traceback instead.
+    """
+
+    @functools.wraps(main)
+    def wrapped() -> None:
+        try:
+            main()
+        except KeyboardInterrupt:
+            sys.exit(130)
+        except Exception as error:
+            if os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
+                raise
+            causes = [error]
+            while (causes[-1].__cause__ or causes[-1].__context__) is not None and _is_hydra(causes[-1]):
+                causes.append(causes[-1].__cause__ or causes[-1].__context__)
+            text = " ".join(" ".join(str(cause) for cause in causes).split())
+            sys.exit(f"error: {text or type(error).__name__}")
+
+    return wrapped
+
+
+def _is_hydra(error: BaseException) -> bool:
+    return type(error).__module__.startswith(("hydra", "omegaconf"))
+
+
+def hydra_main(config_path: str, config_name: str) -> Callable[[Callable[[TrainConfig], None]], Callable[[], None]]:
+    """Decorates ``main(config: TrainConfig)`` with Hydra's command line and the presets as its group ``preset``.
+
+    Args:
+        config_path (str): absolute folder of the YAML files.
+        config_name (str): the file, without its ending.
+
+    Raises:
+        ImportError: on the call, if hydra-core is missing.
+    """
+
+    def decorate(main: Callable[[TrainConfig], None]) -> Callable[[], None]:
+        @one_line_errors
+        @functools.wraps(main)
+        def wrapped() -> None:
+            try:
+                import hydra
+                from hydra.core.config_store import ConfigStore
+                from omegaconf import OmegaConf
+            except ImportError as error:
+                raise ImportError("the examples need hydra-core; run: pip install torchrl_etdmpc[train]") from error
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us instead of being printed over many lines
+            for name, values in PRESETS.items():
+                ConfigStore.instance().store(group="preset", name=name, node=values.to_dict(), package="_global_")
+            _check_preset(sys.argv[1:])
+
+            @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
+            def run(values) -> None:
+                main(TrainConfig.from_dict(OmegaConf.to_container(values, resolve=True)))
+
+            run()
+
+        return wrapped
+
+    return decorate
+
+
+def _check_preset(arguments: list[str]) -> None:
+    for argument in arguments:
+        if argument.startswith("preset="):
+            for name in argument.removeprefix("preset=").split(","):  # a sweep names several
+                preset(name)

@@ -1,0 +1,348 @@
+"""Configuration of a run: frozen, validated dataclasses and the named presets."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from torchrl_etdmpc.envs.tasks import Task, get_task
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    _require(value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}.")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of the networks (thesis Table A.1); see :class:`~torchrl_etdmpc.modules.WorldModel`."""
+
+    latent_dim: int = 512
+    mlp_dim: int = 512
+    encoder_dim: int = 256
+    encoder_layers: int = 1
+    num_dynamics: int = 4
+    num_values: int = 2
+    simnorm_dim: int = 8
+    num_bins: int = 101
+    bin_min: float = -10.0
+    bin_max: float = 10.0
+    dropout: float = 0.01
+    log_std_min: float = -3.0
+    log_std_max: float = 1.0
+    activation: str = "mish"
+    termination: bool = False
+
+    def __post_init__(self) -> None:
+        _require(
+            self.simnorm_dim >= 1 and self.latent_dim >= 1 and self.latent_dim % self.simnorm_dim == 0,
+            f"model.latent_dim must be a multiple of model.simnorm_dim={self.simnorm_dim}, got {self.latent_dim}.",
+        )
+        _require(self.log_std_min < self.log_std_max, "model.log_std_min must be below model.log_std_max.")
+        _require(0 <= self.dropout < 1, f"model.dropout must be in [0, 1), got {self.dropout}.")
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Budget and objective of one planner; see :class:`~torchrl_etdmpc.planners.EnsembleMPPIPlanner`."""
+
+    horizon: int = 6
+    num_samples: int = 512
+    num_elites: int = 64
+    num_proposals: int = 24
+    iterations: int = 6
+    extra_iterations: int = 2
+    large_action_dim: int = 20
+    score: str = "mean"
+    beta: float = 0.0
+    inverse_temperature: float = 0.5
+    std_min: float = 0.05
+    std_max: float = 2.0
+    first_action: str = "elite"
+    eval_first_action: str = "best"
+
+    def __post_init__(self) -> None:
+        group = "reanalyze" if isinstance(self, ReanalyzeConfig) else "planner"
+        for name in ("horizon", "iterations", "num_elites"):
+            _require(getattr(self, name) >= 1, f"{group}.{name} must be at least 1, got {getattr(self, name)}.")
+        _require(
+            self.num_elites <= self.num_samples,
+            f"{group}.num_elites must be at most {group}.num_samples={self.num_samples}, got {self.num_elites}.",
+        )
+        _require(
+            0 <= self.num_proposals < self.num_samples,
+            f"{group}.num_proposals must be in [0, {self.num_samples}), got {self.num_proposals}.",
+        )
+        _require_choice(f"{group}.score", self.score, ("final", "mean", "adaptive"))
+
+
+@dataclass(frozen=True)
+class ReanalyzeConfig(PlannerConfig):
+    """The planner of reanalyze and when it runs; see :class:`~torchrl_etdmpc.replay.ReanalyzeTransform`."""
+
+    horizon: int = 3
+    num_samples: int = 64
+    num_elites: int = 8
+    num_proposals: int = 3
+    score: str = "final"
+    every: int = 10
+    """Decision steps between two reanalyzed batches; 0 turns reanalyze off."""
+    num_slices: int = 20
+    proposal_log_std_min: float = -2.0
+    proposal_log_std_max: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.every >= 0, f"reanalyze.every must not be negative, got {self.every}; 0 turns reanalyze off.")
+        _require(self.num_slices >= 1, f"reanalyze.num_slices must be at least 1, got {self.num_slices}.")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss; see :class:`~torchrl_etdmpc.objectives.EfficientTDMPCLoss`."""
+
+    slice_len: int = 3
+    rho: float = 0.5
+    consistency_coef: float = 20.0
+    reward_coef: float = 0.1
+    value_coef: float = 0.1
+    termination_coef: float = 1.0
+    entropy_coef: float = 1e-4
+    kl_direction: str = "backward"
+    tau: float = 0.01
+    """Rate of the target values and of the running scale."""
+    discount: float | None = None
+    """Default: from the episode length (0.99 for DMC)."""
+
+    def __post_init__(self) -> None:
+        _require(self.slice_len >= 1, f"loss.slice_len must be at least 1, got {self.slice_len}.")
+        _require_choice("loss.kl_direction", self.kl_direction, ("backward", "forward"))
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Optimisation (thesis Table A.1); see :class:`~torchrl_etdmpc.training.Updater`."""
+
+    batch_size: int = 256
+    """Slices per update."""
+    updates_per_decision: int = 1
+    """The UTD ratio: model, value and policy updates per decision step."""
+    lr: float = 3e-4
+    encoder_lr_scale: float = 0.3
+    grad_clip_norm: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "updates_per_decision"):
+            _require(getattr(self, name) >= 1, f"optim.{name} must be at least 1, got {getattr(self, name)}.")
+        _require(self.lr > 0, f"optim.lr must be positive, got {self.lr}.")
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """The buffer and its seed phase."""
+
+    capacity: int = 1_000_000
+    """Transitions; never more than the budget."""
+    insertion: str = "step"
+    uniform_over: str = "episodes"
+    device: str = "cpu"
+    """Where the storage lives: ``cpu``, or ``run`` for the run's device."""
+    seed_decisions: int | None = None
+    """Decisions of uniform random actions. Default: max(1000, 5 episodes)."""
+    pretrain_updates: int | None = None
+    """Updates without the policy loss after the seed phase. Default: as many as there were seed decisions."""
+
+    def __post_init__(self) -> None:
+        _require(self.capacity >= 1, f"replay.capacity must be at least 1, got {self.capacity}.")
+        _require_choice("replay.insertion", self.insertion, ("step", "episode"))
+        _require_choice("replay.uniform_over", self.uniform_over, ("episodes", "starts"))
+        _require_choice("replay.device", self.device, ("cpu", "run"))
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A whole run. Steps that users see are environment steps; one decision is ``action_repeat`` of them."""
+
+    task: str = "walker-walk"
+    preset: str = "efficient-tdmpc"
+    seed: int = 1
+    total_env_steps: int = 200_000
+    run_dir: str | None = None
+    num_envs: int = 1
+    device: str = "auto"
+    compile: str = "auto"
+    logger: str = "none"
+    eval_every: int = 50_000
+    eval_episodes: int = 10
+    eval_policy: bool = False
+    """Whether evaluations also report the policy without the planner."""
+    checkpoint_every: int = 50_000
+    log_every: int = 1_000
+    resume: bool = False
+    threads: int | None = None
+    """CPU threads of PyTorch. Default: PyTorch's own choice."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    reanalyze: ReanalyzeConfig = field(default_factory=ReanalyzeConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+    def __post_init__(self) -> None:
+        task = get_task(self.task)
+        _require(
+            not self.resume, "resume is not implemented yet; start a new run_dir (evaluate.py can load its checkpoints)."
+        )
+        _require_choice("device", self.device.split(":")[0], ("auto", "cpu", "cuda"))
+        _require_choice("compile", self.compile, ("auto", "off", "default"))
+        _require_choice("logger", self.logger, ("none", "tensorboard", "wandb"))
+        for name in ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}.")
+        _require(self.threads is None or self.threads >= 1, f"threads must be at least 1, got {self.threads}.")
+        seed_env_steps = self.seed_decisions * task.action_repeat
+        _require(
+            self.total_env_steps > seed_env_steps,
+            f"total_env_steps must exceed the seed phase of {seed_env_steps} env steps, got {self.total_env_steps}; "
+            "raise the budget or lower replay.seed_decisions.",
+        )
+        _require(
+            self.seed_decisions >= self.loss.slice_len * self.num_envs,
+            f"replay.seed_decisions must be at least loss.slice_len * num_envs={self.loss.slice_len * self.num_envs}, got "
+            f"{self.seed_decisions}.",
+        )
+        if self.replay.insertion == "episode":
+            per_episode = task.decision_steps_per_episode * self.num_envs
+            _require(
+                self.seed_decisions >= per_episode,
+                f"replay.seed_decisions must cover an episode of every environment ({per_episode} decisions) with "
+                f"replay.insertion=episode, got {self.seed_decisions}.",
+            )
+
+    @property
+    def task_spec(self) -> Task:
+        """The task behind the name."""
+        return get_task(self.task)
+
+    @property
+    def seed_decisions(self) -> int:
+        """Length of the seed phase in decisions (spec: max(1000, 5 episodes))."""
+        if self.replay.seed_decisions is not None:
+            return self.replay.seed_decisions
+        return max(1000, 5 * self.task_spec.decision_steps_per_episode)
+
+    @property
+    def pretrain_updates(self) -> int:
+        """Updates without the policy loss after the seed phase."""
+        return self.seed_decisions if self.replay.pretrain_updates is None else self.replay.pretrain_updates
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested plain dictionary, as it is written to ``config.yaml``."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
+        """Inverse of :meth:`to_dict`; missing entries take the default.
+
+        Raises:
+            ValueError: if a key is unknown, or a value has the wrong type or is out of range.
+        """
+        return _from_dict(cls, values, "")
+
+
+def _from_dict(cls: type, values: Mapping[str, Any], prefix: str) -> Any:
+    hints = typing.get_type_hints(cls)
+    unknown = sorted(set(values) - set(hints))
+    _require(not unknown, f"unknown setting {prefix}{unknown[0] if unknown else ''}; known: {', '.join(hints)}.")
+    converted = {}
+    for name, value in values.items():
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint):
+            _require(isinstance(value, Mapping), f"{prefix}{name} must be a group of settings, got {value!r}.")
+            converted[name] = _from_dict(hint, value, f"{prefix}{name}.")
+        else:
+            converted[name] = _convert(hint, value, f"{prefix}{name}")
+    return cls(**converted)
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    if isinstance(hint, types.UnionType):
+        if value is None:
+            return None
+        hint = next(option for option in typing.get_args(hint) if option is not type(None))
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint is int and isinstance(value, float) and value.is_integer():
+        return int(value)  # 2e5 is a natural way to write a budget
+    if hint is str and isinstance(value, bool):
+        return "off" if value is False else "on"  # YAML reads a bare off as a boolean
+    if type(value) is not hint:
+        raise ValueError(f"{name} must be of type {hint.__name__}, got {value!r}.")
+    return value
+
+
+def _preset(name: str, **changes: Any) -> TrainConfig:
+    return TrainConfig(preset=name, **changes)
+
+
+def _efficient_tdmpc(name: str, updates_per_decision: int, reanalyze_every: int) -> TrainConfig:
+    return _preset(
+        name,
+        optim=OptimConfig(updates_per_decision=updates_per_decision),
+        reanalyze=ReanalyzeConfig(every=reanalyze_every),
+    )
+
+
+PRESETS: dict[str, TrainConfig] = {
+    config.preset: config
+    for config in (
+        _efficient_tdmpc("efficient-tdmpc", updates_per_decision=1, reanalyze_every=10),
+        _efficient_tdmpc("efficient-tdmpc-utd2", updates_per_decision=2, reanalyze_every=5),
+        _efficient_tdmpc("efficient-tdmpc-utd4", updates_per_decision=4, reanalyze_every=2),
+        _preset(
+            "bmpc",
+            model=ModelConfig(num_dynamics=1),
+            planner=PlannerConfig(horizon=3, score="final", eval_first_action="elite"),
+            reanalyze=ReanalyzeConfig(num_samples=512, num_elites=64, num_proposals=24),
+            replay=ReplayConfig(insertion="episode"),
+        ),
+        _preset(
+            "cpu",
+            total_env_steps=50_000,
+            eval_every=5_000,
+            threads=1,
+            model=ModelConfig(
+                latent_dim=64,
+                mlp_dim=128,
+                encoder_dim=128,
+                num_dynamics=2,
+                activation="silu",
+            ),
+            planner=PlannerConfig(horizon=3, num_samples=64, num_elites=12, num_proposals=4, iterations=4),
+            reanalyze=ReanalyzeConfig(num_samples=24, num_elites=6, num_proposals=2, iterations=3, num_slices=6),
+            loss=LossConfig(tau=0.02),
+            optim=OptimConfig(batch_size=128, lr=1e-3),
+            replay=ReplayConfig(seed_decisions=1000, pretrain_updates=1000),
+        ),
+    )
+}
+
+
+def preset(name: str) -> TrainConfig:
+    """A preset by name.
+
+    Raises:
+        ValueError: if there is none of that name.
+
+    >>> preset("efficient-tdmpc-utd4").optim.updates_per_decision
+    4
+    """
+    _require(name in PRESETS, f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}.")
+    return PRESETS[name]

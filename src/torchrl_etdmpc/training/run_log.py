@@ -1,0 +1,378 @@
+"""The run directory: what a training run writes while it goes and when it is done.
+
+==================  ==========================================================================
+``config.yaml``     the resolved configuration, written before anything else
+``train.csv``       one row per call of :meth:`RunLog.log_train`; columns fixed by the first row
+``eval.csv``        one row per evaluation, columns :data:`EVAL_COLUMNS`
+``curve.png``       evaluation return against environment steps, see :func:`plot_curve`
+``summary.json``    written last: a directory that holds it is a finished run
+==================  ==========================================================================
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import importlib.util
+import json
+import math
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from torchrl import torchrl_logger
+from torchrl.record.loggers import Logger, get_logger
+
+__all__ = ["COUNTER_COLUMNS", "EVAL_COLUMNS", "RunLog", "library_versions", "plot_curve"]
+
+COUNTER_COLUMNS = ("env_steps", "decision_steps", "updates", "wall_time_s")
+EVAL_COLUMNS = (*COUNTER_COLUMNS, "return_mean", "return_std", "episodes")
+
+_LOGGERS = ("none", "tensorboard", "wandb")
+_RUN_ENTRIES = ("config.yaml", "eval.csv", "train.csv", "summary.json", "checkpoints")
+_PACKAGES = ("torchrl-etdmpc", "torch", "torchrl", "tensordict", "dm-control", "mujoco")
+_OKABE_ITO_BLUE = "#0072B2"
+
+
+class RunLog:
+    """A run directory and, if asked for, a TorchRL logger that receives the same numbers.
+
+    Start one with :meth:`create`. Every row is on disk when the call that wrote it returns, so a
+    killed run loses nothing. The TorchRL logger gets the same values under ``train/`` and
+    ``eval/``, with environment steps on the x axis.
+
+    Args:
+        run_dir: an existing directory.
+        total_env_steps: length of the run in environment steps, for the progress messages.
+        logger: a TorchRL logger, or None to write files only.
+
+    Examples:
+        >>> import tempfile
+        >>> run_dir = Path(tempfile.mkdtemp()) / "walker"
+        >>> log = RunLog.create(run_dir, config={"task": "walker-walk", "seed": 1}, total_env_steps=2000)
+        >>> counters = {"env_steps": 1000, "decision_steps": 500, "updates": 400, "wall_time_s": 9.5}
+        >>> log.log_train({"loss_value": 0.25}, **counters)
+        >>> log.log_eval(return_mean=31.0, return_std=4.0, episodes=10, **counters)
+        >>> log.finish({"task": "walker-walk", "seed": 1, "final_return": 31.0}).name
+        'summary.json'
+        >>> sorted(path.name for path in run_dir.iterdir())
+        ['config.yaml', 'curve.png', 'eval.csv', 'summary.json', 'train.csv']
+    """
+
+    def __init__(self, run_dir: str | os.PathLike[str], *, total_env_steps: int, logger: Logger | None = None):
+        self.run_dir = Path(run_dir).expanduser()
+        self.total_env_steps = total_env_steps
+        self._logger = logger
+        self._train_columns: tuple[str, ...] | None = None
+
+    @classmethod
+    def create(
+        cls,
+        run_dir: str | os.PathLike[str],
+        *,
+        config: Mapping[str, Any],
+        logger: Literal["none", "tensorboard", "wandb"] = "none",
+        total_env_steps: int,
+    ) -> RunLog:
+        """Make a new run directory and write ``config.yaml``; everything is checked before anything is written.
+
+        Args:
+            run_dir: the directory, made with its parents; it may exist if it holds no run.
+            config: the resolved configuration: nested dicts of numbers, strings, booleans, None and lists.
+                ``task``, ``preset`` and ``seed`` at its top level become the title of the curve.
+            logger: who receives the numbers besides our CSV files. ``wandb`` is offline where there is no
+                API key; the environment variable ``WANDB_MODE`` is obeyed.
+            total_env_steps: length of the run in environment steps, at least 1.
+
+        Returns:
+            The log of the new run.
+
+        Raises:
+            ValueError: unknown ``logger``, ``total_env_steps`` below 1, or a ``config`` that YAML cannot hold.
+            ImportError: the extra that ``logger`` needs, or PyYAML, is not installed.
+            FileExistsError: ``run_dir`` already holds a run; nothing in it is touched.
+            OSError: ``run_dir`` cannot be written.
+        """
+        if logger not in _LOGGERS:
+            raise ValueError(f"logger must be one of {', '.join(_LOGGERS)}, got {logger!r}; choose one of them.")
+        if total_env_steps < 1:
+            raise ValueError(f"total_env_steps must be at least 1, got {total_env_steps}; choose a longer run.")
+        if logger != "none":
+            _require_logger(logger)
+        text = _to_yaml(config)
+        run_dir = Path(run_dir).expanduser()
+        if any(os.path.lexists(run_dir / name) for name in _RUN_ENTRIES):
+            raise FileExistsError(f"run_dir={run_dir} already holds a run; choose another run_dir or remove it.")
+        try:
+            run_dir.mkdir(parents=True, exist_ok=True)
+            with open(run_dir / "config.yaml", "x", encoding="utf-8") as file:  # "x": two runs cannot both win
+                file.write(text)
+        except OSError as error:
+            raise OSError(
+                f"run_dir={run_dir} cannot be written ({error.strerror}); choose a directory that you can write to."
+            ) from error
+        try:
+            backend = _make_logger(logger, run_dir, config)
+        except BaseException:
+            (run_dir / "config.yaml").unlink()  # a run that never began must not block its directory
+            raise
+        return cls(run_dir, total_env_steps=total_env_steps, logger=backend)
+
+    def log_train(
+        self, metrics: Mapping[str, float], *, env_steps: int, decision_steps: int, updates: int, wall_time_s: float
+    ) -> None:
+        """Append a row to ``train.csv``.
+
+        Args:
+            metrics: name -> number or one-element tensor. The first call fixes the names; a name that is
+                missing later leaves an empty cell.
+            env_steps: environment steps so far, action repeats counted.
+            decision_steps: actions chosen so far.
+            updates: gradient steps so far.
+            wall_time_s: seconds since the run began.
+
+        Raises:
+            ValueError: a name that the first row did not have, or that is one of the counters.
+            TypeError: a value that is not one number.
+        """
+        counters = _counters(env_steps, decision_steps, updates, wall_time_s)
+        for name in metrics:
+            if name in counters:
+                raise ValueError(f"metrics must not use the counter name {name!r}; rename that metric.")
+            if self._train_columns is not None and name not in self._train_columns:
+                raise ValueError(
+                    f"metrics must keep to the columns of the first row of train.csv, got the new name {name!r}; "
+                    "log it from the first row on, as nan until it is known."
+                )
+        row = {**counters, **{name: _to_float(name, value) for name, value in metrics.items()}}
+        self._train_columns = self._train_columns or tuple(row)
+        self._append("train", row, self._train_columns)
+
+    def log_eval(
+        self,
+        *,
+        env_steps: int,
+        decision_steps: int,
+        updates: int,
+        wall_time_s: float,
+        return_mean: float,
+        return_std: float,
+        episodes: int,
+    ) -> None:
+        """Append a row to ``eval.csv``, whose columns are :data:`EVAL_COLUMNS`.
+
+        Args:
+            env_steps: environment steps so far, action repeats counted.
+            decision_steps: actions chosen so far.
+            updates: gradient steps so far.
+            wall_time_s: seconds since the run began.
+            return_mean: mean over the episodes of the undiscounted return; may be nan.
+            return_std: its standard deviation over the episodes.
+            episodes: number of evaluation episodes.
+
+        Raises:
+            TypeError: ``return_mean`` or ``return_std`` is not one number.
+        """
+        row = {
+            **_counters(env_steps, decision_steps, updates, wall_time_s),
+            "return_mean": _to_float("return_mean", return_mean),
+            "return_std": _to_float("return_std", return_std),
+            "episodes": int(episodes),
+        }
+        self._append("eval", row, EVAL_COLUMNS)
+        torchrl_logger.info(
+            f"env_steps={row['env_steps']} of {self.total_env_steps}: return {row['return_mean']:.1f} "
+            f"+- {row['return_std']:.1f} over {row['episodes']} episodes"
+        )
+
+    def finish(self, summary: Mapping[str, Any]) -> Path:
+        """Write ``curve.png``, then ``summary.json``, and close the logger.
+
+        A curve that cannot be drawn (matplotlib missing, no evaluation) is a warning: the run is done and
+        its summary matters more. Numbers that JSON cannot hold (nan, inf) become null.
+
+        Args:
+            summary: what the run came to; ``versions`` is added from :func:`library_versions` unless given.
+
+        Returns:
+            The path of ``summary.json``.
+        """
+        try:
+            plot_curve(self.run_dir)
+        except (ImportError, OSError, ValueError) as error:
+            torchrl_logger.warning(f"curve.png was not drawn: {error}")
+        path = self.run_dir / "summary.json"
+        content = _to_json({**summary, "versions": summary.get("versions", library_versions())})
+        with _replacing(path) as partial:
+            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        self.close()
+        return path
+
+    def close(self) -> None:
+        """Close the logger; the files need no closing. :meth:`finish` does it, an aborted run may."""
+        if self._logger is not None:
+            self._logger.shutdown()
+            self._logger = None
+
+    def _append(self, split: Literal["train", "eval"], row: dict[str, float], columns: tuple[str, ...]) -> None:
+        path = self.run_dir / f"{split}.csv"
+        is_new = not path.exists()
+        with path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            if is_new:
+                writer.writeheader()
+            writer.writerow(row)
+        if self._logger is not None:
+            values = {f"{split}/{name}": value for name, value in row.items() if name != "env_steps"}
+            self._logger.log_metrics(values, step=row["env_steps"])
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of Python and of those of our libraries that are installed, by distribution name.
+
+    >>> list(library_versions())[0]
+    'python'
+    """
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def plot_curve(run_dir: str | os.PathLike[str]) -> Path:
+    """Draw ``curve.png`` from ``eval.csv``: mean return against environment steps, with a band of one std.
+
+    Args:
+        run_dir: the directory of a run that is running or done; ``config.yaml`` gives the title.
+
+    Returns:
+        The path of ``curve.png``.
+
+    Raises:
+        ImportError: matplotlib or PyYAML is not installed.
+        FileNotFoundError: ``run_dir`` has no ``eval.csv`` or no ``config.yaml``.
+        ValueError: no evaluation has a finite return.
+    """
+    try:
+        import yaml
+        from matplotlib.figure import Figure  # not pyplot: no window, no global state, PNG by Agg
+        from matplotlib.ticker import EngFormatter
+    except ImportError as error:
+        raise ImportError(
+            f"plot_curve needs {error.name}, which is not installed; run `pip install matplotlib pyyaml`."
+        ) from error
+    run_dir = Path(run_dir).expanduser()
+    for name in ("config.yaml", "eval.csv"):
+        if not (run_dir / name).is_file():
+            raise FileNotFoundError(f"run_dir={run_dir} has no {name}; give the directory of a run that has evaluated.")
+    config = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+    with open(run_dir / "eval.csv", newline="", encoding="utf-8") as file:
+        rows = [(float(r["env_steps"]), float(r["return_mean"]), float(r["return_std"])) for r in csv.DictReader(file)]
+    if not any(math.isfinite(mean) for _, mean, _ in rows):
+        raise ValueError(f"run_dir={run_dir} needs an evaluation with a finite return, got none; evaluate first.")
+    steps, means, stds = zip(*rows, strict=True)
+
+    figure = Figure(figsize=(6.4, 4.0), dpi=150, layout="tight")
+    axes = figure.add_subplot()
+    low, high = zip(*((mean - std, mean + std) for mean, std in zip(means, stds, strict=True)), strict=True)
+    axes.fill_between(steps, low, high, color=_OKABE_ITO_BLUE, alpha=0.2, linewidth=0, label="\u00b1 1 std")
+    axes.plot(steps, means, color=_OKABE_ITO_BLUE, linewidth=1.8, marker="o", markersize=3.5, label="mean")
+    axes.set_xlabel("environment steps")
+    axes.set_ylabel("episode return")
+    axes.set_title(", ".join(_title_parts(config)))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=min(0.0, min(value for value in low + means if math.isfinite(value))))
+    axes.grid(linewidth=0.5, alpha=0.4)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, loc="best")
+    path = run_dir / "curve.png"
+    with _replacing(path) as partial:
+        figure.savefig(partial, format="png")
+    return path
+
+
+def _title_parts(config: Mapping[str, Any]) -> list[str]:
+    named = [str(config[key]) for key in ("task", "preset") if key in config]
+    return named + ([f"seed {config['seed']}"] if "seed" in config else [])
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Gives a temporary path beside ``path`` and moves it into place if the block succeeds."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _require_logger(name: str) -> None:
+    spec = importlib.util.find_spec(name)
+    # A plain folder called "wandb" (what wandb leaves behind in the working directory) is found too, without an origin.
+    if spec is None or spec.origin is None:
+        raise ImportError(
+            f"logger={name} needs {name}, which is not installed; run `pip install torchrl_etdmpc[{name}]`."
+        )
+
+
+def _make_logger(name: str, run_dir: Path, config: Mapping[str, Any]) -> Logger | None:
+    if name == "none":
+        return None
+    if name == "tensorboard":
+        return get_logger("tensorboard", logger_name=str(run_dir), experiment_name="tensorboard")
+    import wandb
+
+    # The installed packages and their source locations are the user's business, not the run's.
+    options = {"project": "torchrl_etdmpc", "log_env_packages": False}
+    if "WANDB_MODE" not in os.environ and not wandb.login(prompt=False, verify=False):
+        options["mode"] = "offline"
+    logger = get_logger("wandb", logger_name=str(run_dir), experiment_name=run_dir.name, wandb_kwargs=options)
+    logger.log_hparams(dict(config))
+    return logger
+
+
+def _to_yaml(config: Mapping[str, Any]) -> str:
+    try:
+        import yaml
+    except ImportError as error:
+        raise ImportError("config.yaml needs PyYAML, which is not installed; run `pip install pyyaml`.") from error
+    try:
+        return yaml.safe_dump(dict(config), sort_keys=False)
+    except yaml.YAMLError as error:
+        raise ValueError(
+            f"config must hold plain dicts, lists, numbers and strings, got {error.args[-1]!r}; convert it first."
+        ) from error
+
+
+def _counters(env_steps: int, decision_steps: int, updates: int, wall_time_s: float) -> dict[str, float]:
+    values = (int(env_steps), int(decision_steps), int(updates), round(float(wall_time_s), 3))
+    return dict(zip(COUNTER_COLUMNS, values, strict=True))
+
+
+def _to_float(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(
+            f"{name} must be a number or a one-element tensor, got {type(value).__name__}; reduce it, e.g. by its mean."
+        ) from error
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_json(item) for item in value]
+    if hasattr(value, "tolist"):  # a tensor or a numpy number
+        return _to_json(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

@@ -1,0 +1,180 @@
+"""One training run, from an empty directory to ``summary.json``."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase
+
+from torchrl_etdmpc.collectors import NonFiniteError
+from torchrl_etdmpc.training.builders import (
+    build_agent,
+    build_collector,
+    build_reanalyze,
+    build_replay,
+    resolve_device,
+)
+from torchrl_etdmpc.training.checkpoint import save_checkpoint
+from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
+from torchrl_etdmpc.training.progress import progress_bar
+from torchrl_etdmpc.training.run_log import RunLog
+
+
+class TrainingRun:
+    """Owns the parts of one run and drives them: seed phase, pretraining, then act and update at every decision.
+
+    Args:
+        config (TrainConfig): the run.
+        env (EnvBase): batch size [] or [config.num_envs]; closed at the end.
+        eval_env (EnvBase): batch size [config.eval_episodes]; closed at the end.
+        log (RunLog): the run directory.
+    """
+
+    def __init__(self, config: TrainConfig, *, env: EnvBase, eval_env: EnvBase, log: RunLog) -> None:
+        self.config = config
+        self.log = log
+        self.device = resolve_device(config.device)
+        sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+        self.agent = build_agent(config, *sizes, self.device)
+        self.eval_env = eval_env.append_transform(self.agent.planner.make_tensordict_primer())
+        self.replay = build_replay(config, self.device)
+        self.reanalyze = build_reanalyze(config, self.agent, self.replay)
+        self.collector = build_collector(config, self.agent, env, self.replay)
+        self.action_repeat = config.task_spec.action_repeat
+        self.eval_returns: list[float] = []
+        self._episode_returns: list[float] = []  # training episodes since the last row of train.csv
+        self._metrics: dict[str, torch.Tensor] = {}
+        self._start = time.perf_counter()
+        self._learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps so far, action repeats counted."""
+        return self.collector.frames * self.action_repeat
+
+    def counters(self) -> dict[str, int | float]:
+        """The columns that every file of the run counts by."""
+        return {
+            "env_steps": self.env_steps,
+            "decision_steps": self.collector.frames,
+            "updates": self.agent.updater.updates,
+            "wall_time_s": round(time.perf_counter() - self._start, 2),
+        }
+
+    def run(self) -> dict[str, Any]:
+        """Trains to the budget and writes the summary, which it returns.
+
+        Raises:
+            NonFiniteError: if the environment or the policy breaks; the run is saved first.
+        """
+        config = self.config
+        try:
+            with progress_bar(config.total_env_steps) as progress:
+                self.evaluate()
+                for _ in range(math.ceil(config.seed_decisions / config.num_envs)):
+                    self.step()
+                self.pretrain()
+                while self.env_steps < config.total_env_steps:
+                    tick = time.perf_counter()
+                    self.step()
+                    for _ in range(config.optim.updates_per_decision * config.num_envs):
+                        self.update()
+                    self._learning_s += time.perf_counter() - tick
+                    last = self.env_steps >= config.total_env_steps
+                    if last or self._passed(config.log_every):
+                        self.write_metrics()
+                    if last or self._passed(config.eval_every):
+                        self.evaluate()
+                    if last or self._passed(config.checkpoint_every):
+                        self.save()
+                    progress.update(
+                        env_steps=self.env_steps,
+                        decision_steps=self.collector.frames,
+                        last_return=self.eval_returns[-1],
+                    )
+        except NonFiniteError:
+            self.save()
+            raise
+        finally:
+            self.collector.shutdown(raise_on_error=False)
+            self.eval_env.close(raise_if_closed=False)
+        summary = self.summary()
+        self.log.finish(summary)
+        return summary
+
+    def step(self) -> None:
+        """One decision of every environment."""
+        rows = self.collector.step()
+        self._episode_returns.extend(rows["next", "episode_reward"][rows["next", "done"]].tolist())
+
+    def update(self, *, distill: bool = True) -> None:
+        """One gradient step on a fresh sample."""
+        batch = self.replay.sample().to(self.device).reshape(-1, self.config.loss.slice_len)
+        self._metrics.update(self.agent.updater.step(batch, distill=distill).items())
+
+    def pretrain(self) -> None:
+        """Updates of world model and value on the seed data; the policy has nothing to learn from random actions."""
+        if self.reanalyze is not None:
+            self.reanalyze.enabled = False
+        for _ in range(self.config.pretrain_updates):
+            self.update(distill=False)
+        if self.reanalyze is not None:
+            self.reanalyze.enabled = True
+
+    def evaluate(self) -> None:
+        """Appends a row to ``eval.csv``."""
+        options = {"episodes": self.config.eval_episodes, "policy_device": self.device}
+        returns = evaluate(self.eval_env, self.agent.planner, **options)
+        self.eval_returns.append(returns.mean().item())
+        self.log.log_eval(
+            **self.counters(),
+            return_mean=self.eval_returns[-1],
+            return_std=returns.std(correction=0).item(),
+            episodes=len(returns),
+        )
+        if self.config.eval_policy:
+            bare = evaluate(self.eval_env, BarePolicy(self.agent.world_model), **options)
+            self._metrics["policy_return"] = bare.mean()
+
+    def write_metrics(self) -> None:
+        """Appends a row to ``train.csv``."""
+        row = {name: float(value) for name, value in self._metrics.items()}
+        finished = self._episode_returns
+        row["episode_return"] = sum(finished) / len(finished) if finished else math.nan
+        self._episode_returns = []
+        if self.reanalyze is not None:
+            row["targets_refreshed"] = self.reanalyze.refreshed
+            row["targets_stale"] = self.reanalyze.stale
+            age = self.reanalyze.target_age
+            row["target_age"] = math.nan if age is None else float(age)
+        self.log.log_train(row, **self.counters())
+
+    def save(self) -> None:
+        """Writes ``checkpoints/last.pt``."""
+        save_checkpoint(self.log.run_dir / "checkpoints" / "last.pt", self.agent, self.config, self.counters())
+
+    def summary(self) -> dict[str, Any]:
+        """What the run came to."""
+        learned = self.collector.frames - self.config.seed_decisions
+        return {
+            "task": self.config.task,
+            "preset": self.config.preset,
+            "seed": self.config.seed,
+            "env_steps": self.env_steps,
+            "final_return": self.eval_returns[-1],
+            "best_return": max(self.eval_returns),
+            "wall_time_s": self.counters()["wall_time_s"],
+            "decisions_per_second": learned / self._learning_s if self._learning_s else math.nan,
+            "parameters": sum(parameter.numel() for parameter in self.agent.world_model.parameters()),
+            "device": torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
+            "threads": torch.get_num_threads(),
+        }
+
+    def _passed(self, interval: int) -> bool:
+        """Whether the last step passed a multiple of ``interval`` environment steps."""
+        before = self.env_steps - self.config.num_envs * self.action_repeat
+        return self.env_steps // interval > before // interval

@@ -1,0 +1,118 @@
+"""Frames to an mp4 file, with the ffmpeg that imageio-ffmpeg brings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+__all__ = ["write_mp4"]
+
+
+def write_mp4(
+    frames: torch.Tensor | np.ndarray | Iterable[torch.Tensor | np.ndarray], path: str | os.PathLike[str], fps: float
+) -> Path:
+    """Write an H.264 video that browsers play.
+
+    An odd height or width loses its last row or column, because the format needs even ones. The video is
+    written under a temporary name and moved into place, so ``path`` never holds half a video.
+
+    Args:
+        frames: uint8 RGB, ``[T, H, W, 3]``, or an iterable of ``[H, W, 3]`` frames (one at a time in memory).
+        path: the file, ending in ``.mp4``; its directory is made; an existing file is replaced.
+        fps: frames per second, above 0. For real time: 1 / (seconds between two frames).
+
+    Returns:
+        ``path`` as a :class:`~pathlib.Path`.
+
+    Raises:
+        ImportError: imageio-ffmpeg is not installed.
+        ValueError: no frames, frames of another shape or dtype, ``fps`` not above 0, or another suffix.
+        OSError: ``path`` cannot be written, or ffmpeg failed.
+
+    Examples:
+        >>> import tempfile
+        >>> frames = torch.zeros(5, 32, 48, 3, dtype=torch.uint8)
+        >>> write_mp4(frames, Path(tempfile.mkdtemp()) / "episode.mp4", fps=25).name
+        'episode.mp4'
+    """
+    path = Path(path).expanduser()
+    if path.suffix != ".mp4":
+        raise ValueError(f"path must end in .mp4, got {path}; rename it.")
+    if not fps > 0:
+        raise ValueError(f"fps must be above 0, got {fps}; 30 is usual.")
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(
+            "write_mp4 needs imageio-ffmpeg, which is not installed; run `pip install imageio-ffmpeg`."
+        ) from error
+
+    iterator = iter(frames)
+    first = next(iterator, None)
+    if first is None:
+        raise ValueError("frames must hold at least one frame, got none; record an episode first.")
+    first = _check_frame(first, 0, None)
+    height, width = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.mp4")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.touch()
+    except OSError as error:
+        raise OSError(f"path={path} cannot be written ({error.strerror}); choose another path.") from error
+    try:
+        count = 1
+        # Even sizes need no further alignment; a larger block would make ffmpeg rescale the picture.
+        writer = imageio_ffmpeg.write_frames(str(partial), (width, height), fps=float(fps), macro_block_size=2)
+        try:
+            writer.send(None)
+            _send(writer, first[:height, :width])
+            for frame in iterator:
+                frame = _check_frame(frame, count, first.shape)
+                _send(writer, frame[:height, :width])
+                count += 1
+        finally:
+            writer.close()
+        _check_video(imageio_ffmpeg, partial, count)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def _check_frame(frame: Any, index: int, shape: tuple[int, ...] | None) -> np.ndarray:
+    array = frame.detach().cpu().numpy() if isinstance(frame, torch.Tensor) else np.asarray(frame)
+    if array.dtype != np.uint8:
+        raise ValueError(f"frames must be uint8, got {array.dtype} in frame {index}; scale to 0..255 and convert.")
+    if array.ndim != 3 or array.shape[-1] != 3 or min(array.shape) < 2:
+        raise ValueError(
+            f"frames must be [T, H, W, 3] with H and W at least 2, got frame {index} of shape {list(array.shape)}; "
+            "put the colours last."
+        )
+    if shape is not None and array.shape != shape:
+        raise ValueError(
+            f"frames must all have the size of the first, {list(shape)}, got {list(array.shape)} in frame {index}; "
+            "render them at one size."
+        )
+    return array
+
+
+def _send(writer: Any, frame: np.ndarray) -> None:
+    try:
+        writer.send(np.ascontiguousarray(frame))
+    except OSError as error:
+        raise OSError("ffmpeg stopped before the last frame; see its message above and the free disk space.") from error
+
+
+def _check_video(imageio_ffmpeg: Any, path: Path, count: int) -> None:
+    # The writer does not look at ffmpeg's exit status: a full disk would pass for success.
+    try:
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError:
+        written = 0
+    if written != count:
+        raise OSError(f"ffmpeg wrote {written} of {count} frames; see its message above and the free disk space.")
