@@ -1,18 +1,21 @@
 """Trains EfficientTDMPC on a DeepMind Control task.
 
-    python examples/train_dmc.py task=walker-walk preset=efficient-tdmpc-utd4 seed=1 total_env_steps=200000 run_dir=runs/walker
+    python examples/train_dmc.py task=walker-walk preset=efficient-tdmpc-utd4 seed=1 total_env_steps=200000
 
 Every setting of a preset can be overridden (`planner.horizon=4 optim.lr=1e-3`); `--cfg job` prints them all.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-import torch
+os.environ.setdefault("MUJOCO_GL", "disable")  # MuJoCo looks for a renderer when it is imported; training needs none
 
-from torchrl_etdmpc.envs import make_dmc_env
-from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, hydra_main
+import torch  # noqa: E402
+
+from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, hydra_main  # noqa: E402
 
 
 @hydra_main(config_path=str(Path(__file__).resolve().parent / "config"), config_name="train")

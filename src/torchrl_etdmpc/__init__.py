@@ -1,9 +1,9 @@
 """EfficientTDMPC for TorchRL: a world model with a dynamics ensemble, planned over and distilled into a policy.
 
 Dimensions, everywhere in the package: ``B`` batch, ``T`` steps of a replayed slice, ``N`` candidates, ``P`` proposals,
-``K`` elites, ``I`` iterations, ``H`` horizon, ``D`` depths of the return table, ``F`` dynamics heads, ``V`` value heads,
-``A`` action, ``L`` latent, ``O`` observation, ``M`` bins. ``[..., N, H, A]`` reads "any leading batch, then candidates,
-steps, action dimensions".
+``K`` elites, ``I`` iterations, ``H`` horizon, ``D`` depths of the return table, ``F`` dynamics heads, ``V`` value
+heads, ``A`` action, ``L`` latent, ``O`` observation, ``M`` bins. ``[..., N, H, A]`` reads "any leading batch, then
+candidates, steps, action dimensions".
 """
 
 from torchrl_etdmpc.collectors import NonFiniteError, SeedPolicy, StepCollector

@@ -35,8 +35,8 @@ class StepCollector(BaseCollector):
     weights to synchronise. One iteration yields the transitions just made, batch size ``[num_envs]``.
 
     Args:
-        create_env_fn (EnvBase or callable): an environment (of any batch size) or a function that makes it. It is closed
-            by :meth:`shutdown`.
+        create_env_fn (EnvBase or callable): an environment with at most one batch dimension, or a function that makes
+            it. It is closed by :meth:`shutdown`.
         policy (nn.Module): TensorDict module that writes the action, e.g. a planner.
 
     Keyword Args:
@@ -90,7 +90,9 @@ class StepCollector(BaseCollector):
             raise ValueError(f"insertion must be 'step' or 'episode', got {insertion!r}.")
         env = create_env_fn if isinstance(create_env_fn, EnvBase) else create_env_fn()
         if len(env.batch_size) > 1:
-            raise ValueError(f"StepCollector takes an environment with at most one batch dimension, got {env.batch_size}.")
+            raise ValueError(
+                f"StepCollector takes an environment with at most one batch dimension, got {env.batch_size}."
+            )
         self.env = _with_primer(env, policy)
         self.policy = policy
         self.replay_buffer = replay_buffer
@@ -187,8 +189,8 @@ class StepCollector(BaseCollector):
             if value.is_floating_point() and not value.isfinite().all():
                 rows = value.isfinite().reshape(self.num_envs, -1).all(-1).logical_not().nonzero().flatten().tolist()
                 raise NonFiniteError(
-                    f"{source} returned a non-finite {key!r} at decision step {self._frames} (environments {rows}); the step "
-                    "was not stored."
+                    f"{source} returned a non-finite {key!r} at decision step {self._frames} (environments {rows}); "
+                    "the step was not stored."
                 )
 
     def _check_schema(self, rows: TensorDictBase, seeding: bool) -> None:
@@ -198,8 +200,8 @@ class StepCollector(BaseCollector):
         other = self._schema.get(not seeding)
         if other is not None and other != keys:
             raise ValueError(
-                f"seed_policy and policy must write the same keys; they differ in {sorted(map(str, other ^ keys))}. A row "
-                "without a key would hold uninitialised memory."
+                f"seed_policy and policy must write the same keys; they differ in {sorted(map(str, other ^ keys))}. "
+                "A row without a key would hold uninitialised memory."
             )
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:

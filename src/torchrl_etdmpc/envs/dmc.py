@@ -101,9 +101,7 @@ def make_dmc_env(
     if num_envs == 1:
         env = _make_one(task, device)
     elif not parallel:
-        env = SerialEnv(
-            num_envs, partial(_make_one, task, "cpu"), device=device, num_threads=torch.get_num_threads()
-        )
+        env = SerialEnv(num_envs, partial(_make_one, task, "cpu"), device=device, num_threads=torch.get_num_threads())
     else:
         # The transforms run inside the processes, side by side. Left alone, ParallelEnv would change this process' own
         # number of threads.

@@ -34,22 +34,21 @@ class LatentEnv(ModelBasedEnvBase):
     def __init__(self, world_model: WorldModel, *, head: int | None = None) -> None:
         if head is not None and not 0 <= head < world_model.num_dynamics:
             raise ValueError(f"head must be in 0..{world_model.num_dynamics - 1} or None, got {head}.")
-        device = world_model.bins.device
-        super().__init__(world_model, device=device)
+        like = {"device": world_model.bins.device, "dtype": world_model.bins.dtype}
+        super().__init__(world_model, device=like["device"])
         self.head = head
         size = (world_model.latent_dim,)
-        self.observation_spec = Composite(latent=Unbounded(size, device=device))
-        self.state_spec = Composite(latent=Unbounded(size, device=device))
-        self.action_spec = Bounded(-1.0, 1.0, shape=(world_model.action_dim,), device=device)
-        self.reward_spec = Unbounded((1,), device=device)
+        self.observation_spec = Composite(latent=Unbounded(size, **like))
+        self.state_spec = Composite(latent=Unbounded(size, **like))
+        self.action_spec = Bounded(-1.0, 1.0, shape=(world_model.action_dim,), **like)
+        self.reward_spec = Unbounded((1,), **like)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         """Starts from ``latent`` or encodes ``observation`` if given; from an all-zero observation otherwise."""
         model = self.world_model
         if tensordict is None or ("latent" not in tensordict.keys() and "observation" not in tensordict.keys()):
             batch_size = self.batch_size if tensordict is None else tensordict.batch_size
-            observation = torch.zeros(*batch_size, model.observation_dim, device=model.bins.device)
-            latent = model.encode(observation)
+            latent = model.encode(model.bins.new_zeros(*batch_size, model.observation_dim))
         elif "latent" in tensordict.keys():
             batch_size, latent = tensordict.batch_size, tensordict.get("latent")
         else:

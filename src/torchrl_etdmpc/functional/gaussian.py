@@ -1,7 +1,7 @@
 """The clipped diagonal Gaussian of the policy and of the planner.
 
-The density used everywhere is that of the *unclipped* Gaussian (BMPC, arXiv:2503.18871; thesis 2.4): clipping happens to
-the sampled action only.
+The density used everywhere is that of the *unclipped* Gaussian (BMPC, arXiv:2503.18871; thesis 2.4): clipping happens
+to the sampled action only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def bounded_log_std(raw: Tensor, low: float, high: float) -> Tensor:
     >>> bounded_log_std(torch.tensor(0.0), -3.0, 1.0).item()
     -1.0
     """
-    return low + 0.5 * (high - low) * (raw.tanh() + 1)
+    return low + 0.5 * (high - low) * (torch.tanh(raw) + 1)
 
 
 def clipped_sample(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:

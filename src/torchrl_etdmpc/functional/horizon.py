@@ -45,11 +45,11 @@ def ensemble_variance(returns: Tensor) -> Tensor:
 def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Tensor]:
     r"""Best lower confidence bound over convex mixtures of depths, exactly (thesis Eq. 4.14).
 
-    Maximises ``w.q - beta sqrt(sum_h w_h^2 sigma_h^2)`` over the simplex. The thesis proposes a gradient-based solver;
-    the optimum has a closed form. Stationarity gives ``w_h ~ max(q_h - lambda, 0) / sigma_h^2``, where the optimal value
-    lambda is the unique root of ``sum_h (max(q_h - lambda, 0) / sigma_h)^2 = beta^2``. The left side falls in lambda, so
-    the depths in the support are those h at which it is still below ``beta^2`` when lambda = q_h; the root over a known
-    support is that of a quadratic.
+    Maximises ``w.q - beta sqrt(sum_h w_h^2 sigma_h^2)`` over the simplex. The thesis proposes a gradient-based
+    solver; the optimum has a closed form. Stationarity gives ``w_h ~ max(q_h - lambda, 0) / sigma_h^2``, where the
+    optimal value lambda is the unique root of ``sum_h (max(q_h - lambda, 0) / sigma_h)^2 = beta^2``. The left side
+    falls in lambda, so the depths in the support are those h at which it is at most ``beta^2`` when lambda = q_h;
+    the root over a known support is that of a quadratic.
 
     Args:
         mean (Tensor): q, mean return estimate of each depth, shape ``[..., H]``.
@@ -72,11 +72,13 @@ def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Te
     one_hot = torch.zeros_like(mean).scatter(-1, best_depth, 1.0)
     if beta == 0:
         return best.squeeze(-1), one_hot
-    gap = mean - best  # <= 0: all sums below are relative to the best depth, which keeps them exact in float32
     precision = std.clamp_min(SIGMA_FLOOR).square().reciprocal()
-    excess = (gap.unsqueeze(-2) - gap.unsqueeze(-1)).clamp_min(0)  # [..., h, g] = max(q_g - q_h, 0)
-    support = (precision.unsqueeze(-2) * excess.square()).sum(-1) < beta**2
+    excess = (mean.unsqueeze(-2) - mean.unsqueeze(-1)).clamp_min(0)  # [..., h, g] = max(q_g - q_h, 0)
+    support = (precision.unsqueeze(-2) * excess.square()).sum(-1) <= beta**2
     weight = precision * support
+    # Sums are relative to the most certain depth of the support: in float32, a large offset would swallow its small gap.
+    anchor = mean.gather(-1, weight.argmax(-1, keepdim=True))
+    gap = mean - anchor
     total = weight.sum(-1, keepdim=True)
     centre = (weight * gap).sum(-1, keepdim=True) / total
     spread = (weight * (gap - centre).square()).sum(-1, keepdim=True)
@@ -84,4 +86,4 @@ def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Te
     weights = (gap - root).clamp_min(0) * precision
     norm = weights.sum(-1, keepdim=True)
     weights = torch.where(norm > 0, weights / norm.clamp_min(torch.finfo(norm.dtype).tiny), one_hot)
-    return (best + root).squeeze(-1), weights
+    return (anchor + root).squeeze(-1), weights

@@ -51,7 +51,8 @@ def sample_sequences(plan: Gaussian, noise: Tensor) -> Tensor:
     Returns:
         Tensor: actions, shape ``[..., N, H, A]``.
 
-    >>> sample_sequences(Gaussian(torch.zeros(1, 1), torch.ones(1, 1)), torch.tensor([[[0.5]], [[4.0]]])).flatten().tolist()
+    >>> plan = Gaussian(torch.zeros(1, 1), torch.ones(1, 1))
+    >>> sample_sequences(plan, torch.tensor([[[0.5]], [[4.0]]])).flatten().tolist()
     [0.5, 1.0]
     """
     return (plan.mean.unsqueeze(-3) + plan.std.unsqueeze(-3) * noise).clamp(-1, 1)
@@ -94,8 +95,9 @@ def elite_weights(scores: Tensor, inverse_temperature: float) -> Tensor:
     >>> elite_weights(torch.tensor([0.0, -torch.inf]), 0.5).tolist()
     [1.0, 0.0]
     """
-    none_finite = ~scores.isfinite().any(-1, keepdim=True)
-    return torch.softmax(inverse_temperature * torch.where(none_finite, torch.zeros_like(scores), scores), dim=-1)
+    finite = scores.isfinite()
+    logits = torch.where(finite, inverse_temperature * scores, -torch.inf)  # scaled first: 0 * -inf is NaN
+    return torch.softmax(torch.where(finite.any(-1, keepdim=True), logits, 0), dim=-1)
 
 
 def fit_gaussian(actions: Tensor, weights: Tensor, *, std_min: float, std_max: float) -> Gaussian:

@@ -67,6 +67,8 @@ def discount_from_episode_length(
     0.99
     """
     if decision_steps <= 0:
-        raise ValueError(f"decision_steps must be positive, got {decision_steps}; pass the episode length in decisions.")
+        raise ValueError(
+            f"decision_steps must be positive, got {decision_steps}; pass the episode length in decisions."
+        )
     fraction = decision_steps / denominator
     return min(max((fraction - 1) / fraction, discount_min), discount_max)

@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 def updated_scale(scale: Tensor, batch: Tensor, tau: float) -> Tensor:
-    """Moves a running scale towards the spread between the 5th and the 95th percentile of a batch, never below 1.
+    """Moves a running scale towards the spread between a batch's 5th and 95th percentile, never below 1.
 
-    ``S <- max((1 - tau) S + tau (p95 - p5), 1)`` (TD-MPC2's running scale, arXiv:2310.16828; BMPC applies it to the KL).
+    ``S <- max((1 - tau) S + tau (p95 - p5), 1)`` (TD-MPC2, arXiv:2310.16828; BMPC applies it to the KL).
 
     Args:
         scale (Tensor): the present scale, a scalar.
@@ -22,5 +22,7 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float) -> Tensor:
     >>> updated_scale(torch.tensor(1.0), torch.linspace(0, 100, 101), tau=1.0).item()
     90.0
     """
-    quantiles = torch.quantile(batch.detach().flatten(), torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device))
+    quantiles = torch.quantile(
+        batch.detach().flatten(), torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device)
+    )
     return torch.lerp(scale, (quantiles[1] - quantiles[0]).to(scale.dtype), tau).clamp_min(1.0)

@@ -54,9 +54,9 @@ class EnsembleLinear(nn.Module):
         """Applies the layer: ``[..., in] -> [..., out]``, or ``[E, ..., in] -> [E, ..., out]`` for a stack."""
         leading = x.shape[:-1]
         if self.weight.ndim == 2:
-            return torch.addmm(self.bias, x.reshape(-1, x.shape[-1]), self.weight).view(*leading, -1)
+            return torch.addmm(self.bias, x.reshape(-1, x.shape[-1]), self.weight).view(*leading, self.bias.shape[-1])
         rows = x.reshape(x.shape[0], -1, x.shape[-1])
-        return torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight).view(*leading, -1)
+        return torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight).view(*leading, self.bias.shape[-1])
 
     def extra_repr(self) -> str:
         return "x".join(str(size) for size in self.weight.shape)
@@ -70,7 +70,7 @@ class NormedLinear(EnsembleLinear):
         out_features (int): output size.
         activation (callable): applied last, ``[..., out] -> [..., out]``.
         num_members (int, optional): E, as in :class:`EnsembleLinear`.
-        dropout (float): probability of zeroing an output of the linear map; active only when ``forward`` is asked for it.
+        dropout (float): probability of zeroing an output of the linear map, when ``forward`` is asked for it.
 
     >>> NormedLinear(3, 8, activation=F.mish)(torch.zeros(2, 3)).shape
     torch.Size([2, 8])

@@ -97,6 +97,11 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         register_running_scale(self, scale_tau, kl_direction)
         self.distill = distill
 
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights for every network, made by no update yet; the targets become copies of the new ones."""
+        super().reset_parameters_recursive()
+        self.world_model.version.zero_()
+
     @property
     def distill(self) -> bool:
         """Whether the policy term is computed."""

@@ -164,9 +164,18 @@ class LatentRolloutLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         self._in_keys = None  # a new name for a key changes what dispatch expects
 
+    def __setstate__(self, state) -> None:
+        super().__setstate__(state)
+        # deepcopy clones the entries of a tensordict, which parts a copied loss from its world model.
+        for name in self._attributes:
+            if f"{name}_params" in self._modules:
+                self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
+
     def reset_parameters_recursive(self) -> None:
-        """Draws new weights; target parameters become copies of the new ones."""
-        super().reset_parameters_recursive()
+        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones."""
+        for name in self._attributes:
+            if f"{name}_params" in self._modules:
+                self.__dict__[name].reset_parameters_recursive()
         for name, target in self._modules.items():
             if name.startswith("target_"):
                 target.data.update_(self._modules[name.removeprefix("target_")].data)
@@ -217,11 +226,6 @@ class LatentRolloutLoss(LossModule):
         self._out_keys = keys
 
     def _slices(self, tensordict: TensorDictBase) -> Slices:
-        if tensordict.ndim != 2:
-            raise ValueError(
-                f"{type(self).__name__} needs a batch of slices [B, T], got batch size {list(tensordict.batch_size)}; "
-                "reshape a flat replay sample with sample.reshape(-1, slice_len)."
-            )
         fields = dict.fromkeys(Slices._fields)
         for name in self._reads:
             value = tensordict.get(self._key(name), None)
@@ -229,6 +233,13 @@ class LatentRolloutLoss(LossModule):
                 raise KeyError(
                     f"{type(self).__name__} needs the key {self._key(name)!r} in its input; rename it with "
                     f"loss.set_keys({name.removeprefix('next_')}=...) or store it in the replay buffer."
+                )
+            # The batch size is no guide: dispatch infers a longer one where all entries agree in size.
+            if value.ndim != 3:
+                raise ValueError(
+                    f"{type(self).__name__} needs a batch of slices [B, T] and entries of shape [B, T, features], got "
+                    f"{self._key(name)!r} of shape {list(value.shape)}; reshape a flat replay sample with "
+                    "sample.reshape(-1, slice_len)."
                 )
             fields[name] = value.transpose(0, 1)
         fields["observation"] = fields["observation"][0]
@@ -249,7 +260,7 @@ class LatentRolloutLoss(LossModule):
             coefficients and by ``rho^k`` at step k, and detached scalar metrics.
 
         Raises:
-            ValueError: if the batch size is not [B, T].
+            ValueError: if an entry is not of shape [B, T, features].
             KeyError: if a key is missing.
         """
         slices = self._slices(tensordict)

@@ -22,8 +22,8 @@ def imagined_value_target(
 ) -> Tensor:
     """One-step imagined TD target at encoded latents (thesis Eq. 2.16, and 3.2 with H = 1).
 
-    ``y = R(z, a) + gamma mean_{i,j} (1 - p(f_i(z, a))) Vbar_j(f_i(z, a))``, ``a ~ pi(z)``; p is the predicted probability
-    of termination, 0 without a termination head.
+    ``y = R(z, a) + gamma mean_{i,j} (1 - p(f_i(z, a))) Vbar_j(f_i(z, a))``, ``a ~ pi(z)``; p is the predicted
+    probability of termination, 0 without a termination head.
 
     Args:
         world_model (WorldModel): policy, reward and dynamics.
@@ -136,7 +136,8 @@ def value_terms(
     world_model = loss.world_model
 
     def target_values(latent: Tensor) -> Tensor:
-        with loss.target_value_params.to_module(loss.value):
+        # The default would leave the targets behind as parameters that require a gradient.
+        with loss.target_value_params.to_module(loss.value, preserve_module_state=False):
             logits = loss.value(latent)
         return two_hot_decode(logits, world_model.bins).movedim(0, -1)
 

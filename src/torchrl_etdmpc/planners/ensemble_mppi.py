@@ -113,7 +113,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     ) -> None:
         if not isinstance(env, LatentEnv):
             raise TypeError(
-                f"EnsembleMPPIPlanner needs a LatentEnv, got {type(env).__name__}; wrap the networks: LatentEnv(world_model)."
+                f"EnsembleMPPIPlanner needs a LatentEnv, got {type(env).__name__}; wrap the networks: "
+                "LatentEnv(world_model)."
             )
         for name, number in {"horizon": horizon, "iterations": iterations, "num_elites": num_elites}.items():
             if number < 1:
@@ -200,8 +201,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         latent = tensordict.get("latent", None) if observation is None else None
         if observation is None and latent is None:
             raise KeyError(
-                f"the planner needs {self.observation_key!r} (or 'latent') in its input; pass observation_key=... if your "
-                "environment names it otherwise."
+                f"the planner needs {self.observation_key!r} (or 'latent') in its input; pass observation_key=... if "
+                "your environment names it otherwise."
             )
         explore = exploration_type() is ExplorationType.RANDOM
         carried, carry = self._read_warm_start(tensordict)
@@ -233,8 +234,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             if not self._warned_cold:
                 self._warned_cold = True
                 warnings.warn(
-                    f"neither {self.plan_mean_key!r} nor {self.is_init_key!r} is in the planner's input, so every plan starts "
-                    "cold; append planner.make_tensordict_primer() to the environment, or pass warm_start=False.",
+                    f"neither {self.plan_mean_key!r} nor {self.is_init_key!r} is in the planner's input, so every plan "
+                    "starts cold; append planner.make_tensordict_primer() to the environment or pass warm_start=False.",
                     stacklevel=3,
                 )
             return None, False
@@ -267,8 +268,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
         Args:
             observation (Tensor, optional): ``[..., O]``.
-            plan_mean (Tensor, optional): the previous call's ``Plan.mean``, ``[..., H, A]``; it is shifted here. Default:
-                zeros.
+            plan_mean (Tensor, optional): the previous call's ``Plan.mean``, ``[..., H, A]``; it is shifted here.
+                Default: zeros.
             latent (Tensor, optional): ``[..., L]``, instead of the observation.
             explore (bool): a training action (sampled, ``first_action``) or an evaluation action.
             noise (PlanNoise, optional): from :meth:`draw_noise`. Default: drawn here.
@@ -311,14 +312,18 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                     returns = torch.cat([proposal_returns, returns], dim=1)
                 steps.append(PlanTrace(actions, scores, returns, *gaussian))
 
-        loc, value = self._choose(elites.actions[:, :, 0], elites.scores, weights, gaussian.mean[:, 0], noise.elite, explore)
+        loc, value = self._choose(
+            elites.actions[:, :, 0], elites.scores, weights, gaussian.mean[:, 0], noise.elite, explore
+        )
         policy_mean, policy_log_std = self.world_model.policy(latent)
         policy_std = policy_log_std.exp().clamp(self.std_min, self.std_max)
         loc = torch.where(fallback.unsqueeze(-1), policy_mean, loc)
         scale = torch.where(fallback.unsqueeze(-1), policy_std, gaussian.std[:, 0])
         value = torch.where(fallback, torch.nan, value)
         action = clipped_sample(loc, scale, noise.action) if explore else loc
-        outputs = [field.reshape(batch + field.shape[1:]) for field in (action, loc, scale, value, gaussian.mean, fallback)]
+        outputs = [
+            field.reshape(batch + field.shape[1:]) for field in (action, loc, scale, value, gaussian.mean, fallback)
+        ]
         if not trace:
             return Plan(*outputs, None)
         stacked = (torch.stack(field, dim=1) for field in zip(*steps, strict=True))
@@ -334,7 +339,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         if choice == "best":
             return first[:, 0], scores[:, 0]
         index = sample_elite(weights, uniform).unsqueeze(-1)
-        return first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1])).squeeze(1), scores.gather(1, index).squeeze(1)
+        return first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1])).squeeze(1), scores.gather(
+            1, index
+        ).squeeze(1)
 
     def _propose(self, latent: Tensor, noise: Tensor) -> Tensor:
         """Rolls the policy: ``[B, L]`` and noise ``[B, P, H, A]`` to sequences ``[B, P, H, A]``."""

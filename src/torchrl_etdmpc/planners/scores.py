@@ -1,7 +1,7 @@
 """Planner objectives: how the table of return estimates becomes the score of a candidate.
 
-A score is any callable from ``[..., D, F, V]`` (depth, dynamics head, value head) to ``[...]``. D is the horizon, or 1 for
-a score whose attribute ``depths`` is ``"last"``: the planner then computes values at the last depth only.
+A score is any callable from ``[..., D, F, V]`` (depth, dynamics head, value head) to ``[...]``. D is the horizon, or 1
+for a score whose attribute ``depths`` is ``"last"``: the planner then computes values at the last depth only.
 """
 
 from __future__ import annotations
@@ -96,7 +96,9 @@ class AdaptiveScore:
 
     def __post_init__(self) -> None:
         if self.beta < 0:
-            raise ValueError(f"the adaptive score needs beta >= 0, got {self.beta}; use 'final' or 'mean' for optimism.")
+            raise ValueError(
+                f"the adaptive score needs beta >= 0, got {self.beta}; use 'final' or 'mean' for optimism."
+            )
 
     def __call__(self, returns: Tensor) -> Tensor:
         return adaptive_mixture(ensemble_mean(returns), ensemble_variance(returns).sqrt(), self.beta)[0]

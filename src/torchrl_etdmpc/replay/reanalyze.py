@@ -95,13 +95,13 @@ class ReanalyzeTransform(Transform):
         """
         if not getattr(replay_buffer.writer, "tracks_generations", False):
             raise ValueError(
-                "reanalyze writes back to the buffer and must know whether a row was overwritten; build the buffer with "
-                "writer=TensorDictRoundRobinWriter(track_generations=True)."
+                "reanalyze writes back to the buffer and must know whether a row was overwritten; build the buffer "
+                "with writer=TensorDictRoundRobinWriter(track_generations=True)."
             )
         if getattr(replay_buffer, "_prefetch", False):
             raise ValueError(
-                "reanalyze runs the planner inside sample(), which a prefetching buffer would do in a thread beside the "
-                "optimiser; build the buffer without prefetch."
+                "reanalyze runs the planner inside sample(), which a prefetching buffer would do in a thread beside "
+                "the optimiser; build the buffer without prefetch."
             )
         self.__dict__["replay_buffer"] = replay_buffer
         replay_buffer.append_transform(self)

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.data.replay_buffers.storages import Storage
+from torchrl.data.replay_buffers.storages import Storage, TensorStorage
 
 UniformOver = Literal["episodes", "starts"]
 
@@ -34,9 +34,9 @@ class _Segments:
     def view(self) -> np.ndarray:
         return self.table[:, : self.size]
 
-    def drop_first(self, number: int) -> None:
-        self.table = self.table[:, number:].copy() if self.size > number else np.zeros((len(self.fields), 64), np.int64)
-        self.size -= number
+    def keep(self, mask: np.ndarray) -> None:
+        self.table = np.pad(self.view()[:, mask], ((0, 0), (0, 64)))
+        self.size = int(mask.sum())
 
 
 class StepSliceSampler(Sampler):
@@ -56,12 +56,14 @@ class StepSliceSampler(Sampler):
     Keyword Args:
         traj_key (NestedKey): where the storage holds the trajectory's id, written by TorchRL's collectors. Default:
             ``("collector", "traj_ids")``.
-        uniform_over (str): ``"episodes"`` draws a trajectory uniformly and then a start, which favours the running
-            episode (what the public lineage does); ``"starts"`` draws uniformly over all starts. Default: ``"episodes"``.
+        uniform_over (str): ``"episodes"`` draws a trajectory uniformly and then a start, which favours the
+            running episode (what the public lineage does); ``"starts"`` draws uniformly over all starts. Default:
+            ``"episodes"``.
 
     Raises:
         ValueError: if an argument is out of range, or a batch size is not a multiple of ``slice_len``.
-        RuntimeError: if there is no complete slice yet.
+        TypeError: if the storage is not a flat tensor storage.
+        RuntimeError: if there is no complete slice yet, or the sampler missed writes.
 
     >>> from tensordict import TensorDict
     >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -90,6 +92,7 @@ class StepSliceSampler(Sampler):
 
     def _empty(self) -> None:
         self._written = 0  # rows ever written; row r of the storage holds write number r modulo the capacity
+        self._newest: int | Tensor | None = None  # row of the last write, once there is one
         self._followed = 0  # rows whose trajectory is in the table
         self._segments = _Segments()
         self._open: dict[int, int] = {}  # trajectory id -> its last segment
@@ -97,10 +100,12 @@ class StepSliceSampler(Sampler):
     def add(self, index: int) -> None:
         """Called by the replay buffer after one row was written."""
         self._written += 1
+        self._newest = index
 
     def extend(self, index: Tensor) -> None:
         """Called by the replay buffer after several rows were written."""
         self._written += len(index)
+        self._newest = index[-1]
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draws the rows of ``batch_size / slice_len`` slices, slice after slice, shape ``[batch_size]``."""
@@ -113,8 +118,8 @@ class StepSliceSampler(Sampler):
         total = int(counts.sum())
         if total == 0:
             raise RuntimeError(
-                f"no trajectory in the buffer has {self.slice_len} steps yet ({len(storage)} rows); collect more before "
-                "sampling."
+                f"no trajectory in the buffer has {self.slice_len} steps yet ({len(storage)} rows); collect more "
+                "before sampling."
             )
         start, stride, _, _ = self._segments.view()
         draws = torch.rand(2, batch_size // self.slice_len, dtype=torch.float64, generator=self._rng).numpy()
@@ -144,11 +149,18 @@ class StepSliceSampler(Sampler):
 
     def _follow(self, storage: Storage) -> None:
         """Adds the rows written since the last call to the table and forgets segments that were overwritten."""
+        if not isinstance(storage, TensorStorage) or storage.ndim > 1:
+            raise TypeError(
+                "StepSliceSampler needs a one-dimensional tensor storage, got "
+                f"{type(storage).__name__}(ndim={storage.ndim}); use LazyTensorStorage(capacity) or "
+                "LazyMemmapStorage(capacity) and write flat rows."
+            )
         capacity = storage.max_size
-        if len(storage) != min(self._written, capacity):
+        newest = self._written - 1 if self._newest is None else int(self._newest)
+        if len(storage) != min(self._written, capacity) or (newest + 1 - self._written) % capacity:
             raise RuntimeError(
-                f"the sampler saw {self._written} writes but the storage holds {len(storage)} of {capacity} rows; attach the "
-                "sampler before the first write, and save and load it together with the storage."
+                f"the sampler saw {self._written} writes but the storage holds {len(storage)} of {capacity} rows; "
+                "attach the sampler before the first write, and save and load it together with the storage."
             )
         oldest = self._written - capacity
         begin = max(self._followed, oldest)
@@ -156,7 +168,7 @@ class StepSliceSampler(Sampler):
             for count, trajectory in zip(
                 range(begin, self._written), self._trajectories(storage, begin, capacity), strict=True
             ):
-                self._append(count, trajectory)
+                self._append(count, trajectory, oldest)
             self._followed = self._written
         self._forget(oldest)
 
@@ -164,17 +176,17 @@ class StepSliceSampler(Sampler):
         column = storage[:].get(self.traj_key, None)
         if column is None:
             raise KeyError(
-                f"StepSliceSampler needs the trajectory id {self.traj_key!r} in every row; collect with StepCollector or a "
-                "TorchRL collector (track_traj_ids=True), or pass traj_key=..."
+                f"StepSliceSampler needs the trajectory id {self.traj_key!r} in every row; collect with StepCollector "
+                "or a TorchRL collector (track_traj_ids=True), or pass traj_key=..."
             )
         rows = torch.arange(begin, self._written, device=column.device) % capacity
         return column[rows].reshape(-1).tolist()
 
-    def _append(self, count: int, trajectory: int) -> None:
+    def _append(self, count: int, trajectory: int, oldest: int) -> None:
         position = self._open.get(trajectory)
         if position is not None:
             start, stride, length, _ = self._segments.table[:, position]
-            if length == 1:
+            if length == 1 and start >= oldest:
                 self._segments.table[1, position] = count - start
                 self._segments.table[2, position] = 2
                 return
@@ -184,16 +196,12 @@ class StepSliceSampler(Sampler):
         self._open[trajectory] = self._segments.append(count, trajectory)
 
     def _forget(self, oldest: int) -> None:
-        start, stride, length, trajectory = self._segments.view()
-        gone = 0
-        while gone < self._segments.size and start[gone] + stride[gone] * (length[gone] - 1) < oldest:
-            gone += 1
-        if gone > max(64, self._segments.size // 2):
-            for position in range(gone):
-                if self._open.get(int(trajectory[position])) == position:
-                    del self._open[int(trajectory[position])]
-            self._segments.drop_first(gone)
-            self._open = {key: position - gone for key, position in self._open.items()}
+        start, stride, length, _ = self._segments.view()
+        alive = start + stride * (length - 1) >= oldest
+        if len(alive) - alive.sum() > max(64, len(alive) // 2):
+            moved = alive.cumsum() - 1
+            self._open = {key: int(moved[position]) for key, position in self._open.items() if alive[position]}
+            self._segments.keep(alive)
 
     def state_dict(self) -> dict[str, Any]:
         """The table of trajectories and the write count."""

@@ -27,6 +27,7 @@ class Agent:
 
     world_model: WorldModel
     planner: EnsembleMPPIPlanner
+    eval_planner: EnsembleMPPIPlanner
     reanalyze_planner: EnsembleMPPIPlanner
     loss: EfficientTDMPCLoss
     updater: Updater
@@ -42,19 +43,23 @@ def resolve_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device(name)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto.")
+        raise ValueError(
+            f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
+        )
     return device
 
 
 def resolve_compile(setting: str, device: torch.device) -> str | None:
     """The ``torch.compile`` mode of ``auto``, ``off`` or ``default``; ``None`` is eager.
 
-    ``auto`` compiles where a compiler exists: always on CUDA, on a CPU if there is a C++ compiler. It warns once if not.
+    ``auto`` compiles where a compiler exists: always on CUDA, on a CPU if there is a C++ compiler; it warns if not.
     """
     if setting == "off":
         return None
     if setting == "auto" and device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
-        warnings.warn("no C++ compiler found, so nothing is compiled and training is slower; install g++.", stacklevel=2)
+        warnings.warn(
+            "no C++ compiler found, so nothing is compiled and training is slower; install g++.", stacklevel=2
+        )
         return None
     return "default"
 
@@ -115,7 +120,9 @@ def build_planner(
     return planner
 
 
-def build_agent(config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu") -> Agent:
+def build_agent(
+    config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+) -> Agent:
     """World model, both planners, loss and updater.
 
     Args:
@@ -126,6 +133,9 @@ def build_agent(config: TrainConfig, observation_dim: int, action_dim: int, devi
     """
     device = torch.device(device)
     compile_mode = resolve_compile(config.compile, device)
+    # On a CPU compilation pays where operator overhead dominates, which is planning for one state; the large batches of
+    # the loss and of evaluations gain nothing from it and would add minutes of compilation.
+    batched_mode = compile_mode if device.type == "cuda" else None
     discount = config.loss.discount
     if discount is None:
         discount = discount_from_episode_length(config.task_spec.decision_steps_per_episode)
@@ -148,9 +158,12 @@ def build_agent(config: TrainConfig, observation_dim: int, action_dim: int, devi
         encoder_lr_scale=config.optim.encoder_lr_scale,
         grad_clip_norm=config.optim.grad_clip_norm,
         tau=config.loss.tau,
-        compile_mode=compile_mode,
+        compile_mode=batched_mode,
     )
     planner = build_planner(world_model, config.planner, discount=discount, warm_start=True, compile_mode=compile_mode)
+    eval_planner = build_planner(
+        world_model, config.planner, discount=discount, warm_start=True, compile_mode=batched_mode
+    )
     reanalyze_planner = build_planner(
         world_model,
         config.reanalyze,
@@ -159,7 +172,7 @@ def build_agent(config: TrainConfig, observation_dim: int, action_dim: int, devi
         proposal_log_std_bounds=(config.reanalyze.proposal_log_std_min, config.reanalyze.proposal_log_std_max),
         compile_mode=compile_mode,
     )
-    return Agent(world_model, planner, reanalyze_planner, loss, updater)
+    return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater)
 
 
 def build_replay(config: TrainConfig, device: torch.device | str = "cpu") -> TensorDictReplayBuffer:

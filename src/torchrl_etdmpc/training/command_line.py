@@ -6,8 +6,9 @@ import functools
 import os
 import sys
 from collections.abc import Callable
+from typing import Any
 
-from torchrl_etdmpc.training.config import PRESETS, TrainConfig, preset
+from torchrl_etdmpc.training.config import PRESETS, TrainConfig, config_from_dict, preset
 
 
 def one_line_errors(main: Callable[[], None]) -> Callable[[], None]:
@@ -38,18 +39,21 @@ def _is_hydra(error: BaseException) -> bool:
     return type(error).__module__.startswith(("hydra", "omegaconf"))
 
 
-def hydra_main(config_path: str, config_name: str) -> Callable[[Callable[[TrainConfig], None]], Callable[[], None]]:
-    """Decorates ``main(config: TrainConfig)`` with Hydra's command line and the presets as its group ``preset``.
+def hydra_main(
+    config_path: str, config_name: str, config_class: type = TrainConfig
+) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
+    """Decorates ``main(config)`` with Hydra's command line and the presets as its group ``preset``.
 
     Args:
         config_path (str): absolute folder of the YAML files.
         config_name (str): the file, without its ending.
+        config_class (type): dataclass that ``main`` receives, checked. Default: :class:`TrainConfig`.
 
     Raises:
         ImportError: on the call, if hydra-core is missing.
     """
 
-    def decorate(main: Callable[[TrainConfig], None]) -> Callable[[], None]:
+    def decorate(main: Callable[[Any], None]) -> Callable[[], None]:
         @one_line_errors
         @functools.wraps(main)
         def wrapped() -> None:
@@ -65,8 +69,11 @@ def hydra_main(config_path: str, config_name: str) -> Callable[[Callable[[TrainC
             _check_preset(sys.argv[1:])
 
             @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
+            @one_line_errors  # inside as well: Hydra would add a line of its own to an exception that passes through it
             def run(values) -> None:
-                main(TrainConfig.from_dict(OmegaConf.to_container(values, resolve=True)))
+                main(
+                    config_from_dict(config_class, OmegaConf.to_container(values, resolve=True, throw_on_missing=True))
+                )
 
             run()
 

@@ -199,7 +199,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         task = get_task(self.task)
         _require(
-            not self.resume, "resume is not implemented yet; start a new run_dir (evaluate.py can load its checkpoints)."
+            not self.resume,
+            "resume is not implemented yet; start a new run_dir (evaluate.py can load its checkpoints).",
         )
         _require_choice("device", self.device.split(":")[0], ("auto", "cpu", "cuda"))
         _require_choice("compile", self.compile, ("auto", "off", "default"))
@@ -215,8 +216,8 @@ class TrainConfig:
         )
         _require(
             self.seed_decisions >= self.loss.slice_len * self.num_envs,
-            f"replay.seed_decisions must be at least loss.slice_len * num_envs={self.loss.slice_len * self.num_envs}, got "
-            f"{self.seed_decisions}.",
+            f"replay.seed_decisions must be at least loss.slice_len * num_envs={self.loss.slice_len * self.num_envs}, "
+            f"got {self.seed_decisions}.",
         )
         if self.replay.insertion == "episode":
             per_episode = task.decision_steps_per_episode * self.num_envs
@@ -254,10 +255,20 @@ class TrainConfig:
         Raises:
             ValueError: if a key is unknown, or a value has the wrong type or is out of range.
         """
-        return _from_dict(cls, values, "")
+        return config_from_dict(cls, values)
 
 
-def _from_dict(cls: type, values: Mapping[str, Any], prefix: str) -> Any:
+def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
+    """A (nested) configuration dataclass from a dictionary, with every value's type checked.
+
+    Args:
+        cls (type): the dataclass.
+        values (mapping): its fields, nested dataclasses as mappings; missing fields take their default.
+        prefix (str): path of the group, for messages.
+
+    Raises:
+        ValueError: if a key is unknown, or a value has the wrong type or is out of range.
+    """
     hints = typing.get_type_hints(cls)
     unknown = sorted(set(values) - set(hints))
     _require(not unknown, f"unknown setting {prefix}{unknown[0] if unknown else ''}; known: {', '.join(hints)}.")
@@ -266,7 +277,7 @@ def _from_dict(cls: type, values: Mapping[str, Any], prefix: str) -> Any:
         hint = hints[name]
         if dataclasses.is_dataclass(hint):
             _require(isinstance(value, Mapping), f"{prefix}{name} must be a group of settings, got {value!r}.")
-            converted[name] = _from_dict(hint, value, f"{prefix}{name}.")
+            converted[name] = config_from_dict(hint, value, f"{prefix}{name}.")
         else:
             converted[name] = _convert(hint, value, f"{prefix}{name}")
     return cls(**converted)
@@ -318,18 +329,12 @@ PRESETS: dict[str, TrainConfig] = {
             total_env_steps=50_000,
             eval_every=5_000,
             threads=1,
-            model=ModelConfig(
-                latent_dim=64,
-                mlp_dim=128,
-                encoder_dim=128,
-                num_dynamics=2,
-                activation="silu",
-            ),
-            planner=PlannerConfig(horizon=3, num_samples=64, num_elites=12, num_proposals=4, iterations=4),
+            model=ModelConfig(latent_dim=64, mlp_dim=96, encoder_dim=128, num_dynamics=2, activation="silu"),
+            planner=PlannerConfig(horizon=3, num_samples=48, num_elites=10, num_proposals=4, iterations=3),
             reanalyze=ReanalyzeConfig(num_samples=24, num_elites=6, num_proposals=2, iterations=3, num_slices=6),
-            loss=LossConfig(tau=0.02),
-            optim=OptimConfig(batch_size=128, lr=1e-3),
-            replay=ReplayConfig(seed_decisions=1000, pretrain_updates=1000),
+            loss=LossConfig(tau=0.03),
+            optim=OptimConfig(batch_size=64, lr=1e-3),
+            replay=ReplayConfig(pretrain_updates=1000),
         ),
     )
 }

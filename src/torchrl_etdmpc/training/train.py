@@ -40,7 +40,7 @@ class TrainingRun:
         self.device = resolve_device(config.device)
         sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
         self.agent = build_agent(config, *sizes, self.device)
-        self.eval_env = eval_env.append_transform(self.agent.planner.make_tensordict_primer())
+        self.eval_env = eval_env.append_transform(self.agent.eval_planner.make_tensordict_primer())
         self.replay = build_replay(config, self.device)
         self.reanalyze = build_reanalyze(config, self.agent, self.replay)
         self.collector = build_collector(config, self.agent, env, self.replay)
@@ -128,7 +128,7 @@ class TrainingRun:
     def evaluate(self) -> None:
         """Appends a row to ``eval.csv``."""
         options = {"episodes": self.config.eval_episodes, "policy_device": self.device}
-        returns = evaluate(self.eval_env, self.agent.planner, **options)
+        returns = evaluate(self.eval_env, self.agent.eval_planner, **options)
         self.eval_returns.append(returns.mean().item())
         self.log.log_eval(
             **self.counters(),

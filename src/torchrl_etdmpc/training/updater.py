@@ -14,8 +14,8 @@ from torchrl_etdmpc.objectives import EfficientTDMPCLoss
 class Updater:
     """Updates world model, value heads and policy on a batch of slices.
 
-    The policy's gradient never reaches the world model nor the other way round (thesis 2.4), so one backward pass of the
-    summed loss is the model step followed by the policy step on the detached latents. The gradients of the two are
+    The policy's gradient never reaches the world model nor the other way round (thesis 2.4), so one backward pass of
+    the summed loss is the model step followed by the policy step on the detached latents. The gradients of the two are
     clipped separately; Adam with ``eps=1e-5`` serves the policy (TD-MPC2).
 
     Args:
@@ -47,7 +47,9 @@ class Updater:
     ) -> None:
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
-        networks = [name for name in ("dynamics", "reward", "value", "termination") if f"{name}_params" in loss._modules]
+        networks = [
+            name for name in ("dynamics", "reward", "value", "termination") if f"{name}_params" in loss._modules
+        ]
         encoder = list(loss.encoder_params.parameters())
         heads = [parameter for name in networks for parameter in getattr(loss, f"{name}_params").parameters()]
         self.model_parameters = encoder + heads

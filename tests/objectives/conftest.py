@@ -1,0 +1,324 @@
+"""Warm networks, random slices, and the losses written once more in plain PyTorch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, SoftUpdate
+
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import (
+    EfficientTDMPCLoss,
+    EfficientTDMPCModelLoss,
+    EfficientTDMPCPolicyLoss,
+    EfficientTDMPCValueLoss,
+)
+from torchrl_etdmpc.testing import random_slices
+
+OBSERVATION_DIM, ACTION_DIM = 5, 3
+LOSSES = {
+    "whole": EfficientTDMPCLoss,
+    "model": EfficientTDMPCModelLoss,
+    "value": EfficientTDMPCValueLoss,
+    "policy": EfficientTDMPCPolicyLoss,
+}
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def double_precision() -> Iterator[None]:
+    """Everything that the test builds is in float64, so that two ways to the same number agree to many digits."""
+    previous = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(previous)
+
+
+@pytest.fixture(params=sorted(LOSSES))
+def kind(request: pytest.FixtureRequest) -> str:
+    """The name of each loss in turn."""
+    return request.param
+
+
+@pytest.fixture
+def make_world_model() -> Callable[..., WorldModel]:
+    """Builds small networks with random biases and no zero layer: nothing is the same by accident."""
+
+    def make(**options) -> WorldModel:
+        sizes = {"latent_dim": 16, "mlp_dim": 12, "encoder_dim": 10, "num_dynamics": 2, "num_values": 2}
+        sizes |= {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM, "simnorm_dim": 4, "num_bins": 21}
+        world_model = WorldModel(**(sizes | options))
+        _disturb(world_model.parameters())
+        return world_model
+
+    return make
+
+
+@pytest.fixture
+def make_loss(make_world_model: Callable[..., WorldModel]) -> Callable[..., LossModule]:
+    """Builds a loss by name; its target values have an updater and differ from the values, unless declined."""
+
+    def make(kind: str = "whole", world_model: WorldModel | None = None, *, updater: bool = True, **options):
+        has_targets = kind in ("whole", "value")
+        if has_targets:
+            options = {"discount": 0.9, **options}
+        loss = LOSSES[kind](make_world_model() if world_model is None else world_model, **options)
+        if has_targets and updater:
+            SoftUpdate(loss, tau=0.01)
+            _disturb(loss.target_value_params.buffers())
+        return loss
+
+    return make
+
+
+@pytest.fixture
+def make_slices() -> Callable[..., TensorDict]:
+    """Builds random slices with random flags in every step."""
+
+    def make(num_slices: int = 4, slice_len: int = 3, **dims) -> TensorDict:
+        sizes = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM} | dims
+        slices = random_slices(**sizes, num_slices=num_slices, slice_len=slice_len)
+        for flag in ("terminated", "truncated", "done"):
+            slices["next", flag] = torch.rand(num_slices, slice_len, 1) < 0.5
+        return slices
+
+    return make
+
+
+@pytest.fixture
+def slices(make_slices: Callable[..., TensorDict]) -> TensorDict:
+    """Four slices of three steps."""
+    return make_slices()
+
+
+@pytest.fixture
+def run_seeded() -> Callable[..., TensorDict]:
+    """Runs a loss on a fixed seed, so that two calls see the same policy noise (and dropout)."""
+
+    def run(loss: LossModule, *args, seed: int = 7, **kwargs) -> TensorDict:
+        torch.manual_seed(seed)
+        return loss(*args, **kwargs)
+
+    return run
+
+
+@pytest.fixture
+def assert_same_output() -> Callable[..., None]:
+    """Asserts that two outputs have the same keys and numbers."""
+
+    def check(actual: TensorDict, expected: TensorDict, **tolerances) -> None:
+        assert sorted(actual.keys()) == sorted(expected.keys())
+        for key, value in expected.items():
+            torch.testing.assert_close(actual[key], value, msg=lambda text, key=key: f"{key}: {text}", **tolerances)
+
+    return check
+
+
+@pytest.fixture
+def gradients() -> Callable[[Tensor, WorldModel], dict[str, dict[str, Tensor | None]]]:
+    """Gradients of a scalar by network and parameter; ``None`` where the graph does not reach."""
+
+    def compute(scalar: Tensor, world_model: WorldModel) -> dict[str, dict[str, Tensor | None]]:
+        named = dict(world_model.named_parameters())
+        found = torch.autograd.grad(scalar, list(named.values()), allow_unused=True, retain_graph=True)
+        by_network: dict[str, dict[str, Tensor | None]] = {}
+        for name, gradient in zip(named, found, strict=True):
+            network, parameter = name.split(".", 1)
+            by_network.setdefault(network.removesuffix("_head"), {})[parameter] = gradient
+        return by_network
+
+    return compute
+
+
+@pytest.fixture
+def plain_errors() -> Callable[..., dict[str, Tensor]]:
+    """The reference: see :func:`_plain_errors`."""
+    return _plain_errors
+
+
+@pytest.fixture
+def depth_mean() -> Callable[..., Tensor]:
+    """``mean_{B,T} rho^k error_k`` of an error ``[B, T]``, step by step."""
+
+    def reduce(error: Tensor, rho: float = 0.5) -> Tensor:
+        steps = error.shape[1]
+        return sum(rho**k * error[:, k].mean() for k in range(steps)) / steps
+
+    return reduce
+
+
+def _disturb(tensors) -> None:
+    with torch.no_grad():
+        for tensor in tensors:
+            tensor.add_(0.3 * torch.randn_like(tensor))
+
+
+# The losses of the paper, written again head by head and step by step. Of the package, nothing is used but the weights.
+
+
+def _plain_errors(
+    loss: LossModule, slices: TensorDict, noise: Tensor, *, kl_direction: str = "backward"
+) -> dict[str, Tensor]:
+    """Unweighted errors ``[B, T]`` with gradient, without dropout.
+
+    Args:
+        loss (LossModule): the weights; the targets are the value heads' own where the loss has none.
+        slices (TensorDict): ``[B, T]``.
+        noise (Tensor): the policy's noise in the value targets, ``[T, B, A]``.
+        kl_direction (str): as in the loss.
+    """
+    world_model = loss.world_model
+    group = world_model.encoder.output.activation.keywords["group_size"]
+    bins = world_model.bins
+    weights = {name: dict(network.named_parameters()) for name, network in world_model.named_children()}
+    target_values = weights["value_head"]
+    if "target_value_params" in loss._modules:
+        target_values = dict(loss._modules["target_value_params"].named_buffers())
+    num_dynamics, num_values = world_model.num_dynamics, world_model.num_values
+    steps = slices.shape[1]
+
+    def encode(observation: Tensor) -> Tensor:
+        return _simnorm(_network(weights["encoder"], observation, hidden=1), group)
+
+    def step(head: int, latent: Tensor, action: Tensor) -> Tensor:
+        return _simnorm(_network(weights["dynamics"], torch.cat([latent, action], -1), hidden=2, member=head), group)
+
+    def reward_logits(latent: Tensor, action: Tensor) -> Tensor:
+        return _network(weights["reward_head"], torch.cat([latent, action], -1), hidden=2)
+
+    def termination_logit(latent: Tensor) -> Tensor:
+        return _network(weights["termination_head"], latent, hidden=2)[..., 0]
+
+    def policy(latent: Tensor) -> tuple[Tensor, Tensor]:
+        out = _network(weights["policy"], latent, hidden=2)
+        size = out.shape[-1] // 2
+        low, high = world_model.policy.log_std_bounds
+        return torch.tanh(out[..., :size]), torch.exp(low + (high - low) * (torch.tanh(out[..., size:]) + 1) / 2)
+
+    encoded = [encode(slices["observation"][:, 0])]
+    encoded += [encode(slices["next", "observation"][:, k]).detach() for k in range(steps)]
+    rollouts = []
+    for head in range(num_dynamics):
+        rollout = [encoded[0]]
+        for k in range(steps):
+            rollout.append(step(head, rollout[k], slices["action"][:, k]))
+        rollouts.append(rollout)
+
+    errors: dict[str, list[Tensor]] = {}
+    for k in range(steps):
+        action = slices["action"][:, k]
+        with torch.no_grad():
+            mean, std = policy(encoded[k])
+            imagined_action = torch.clip(mean + std * noise[k], -1, 1)
+            future = 0.0
+            for i in range(num_dynamics):
+                imagined = step(i, encoded[k], imagined_action)
+                alive = 1.0
+                if "termination_head" in weights:
+                    alive = 1 - 1 / (1 + torch.exp(-termination_logit(imagined)))
+                for j in range(num_values):
+                    value = _expected(_network(target_values, imagined, hidden=2, member=j), bins)
+                    future = future + alive * value / (num_dynamics * num_values)
+            target = _expected(reward_logits(encoded[k], imagined_action), bins) + float(loss.discount) * future
+        here: dict[str, list[Tensor]] = {}
+        for i in range(num_dynamics):
+            latent, successor = rollouts[i][k], rollouts[i][k + 1]
+            here.setdefault("consistency", []).append((successor - encoded[k + 1].detach()).pow(2).mean(-1))
+            reward = slices["next", "reward"][:, k, 0]
+            here.setdefault("reward", []).append(_cross_entropy(reward_logits(latent, action), reward, bins))
+            for j in range(num_values):
+                logits = _network(weights["value_head"], latent, hidden=2, member=j)
+                here.setdefault("value", []).append(_cross_entropy(logits, target, bins))
+            if "termination_head" in weights:
+                logit = termination_logit(successor)
+                flag = slices["next", "terminated"][:, k, 0]
+                here.setdefault("termination", []).append(torch.log(1 + torch.exp(torch.where(flag, -logit, logit))))
+            mean, std = policy(latent.detach())
+            pi = torch.distributions.Normal(mean, std)
+            plan = torch.distributions.Normal(slices["plan", "loc"][:, k], slices["plan", "scale"][:, k])
+            pair = (pi, plan) if kl_direction == "backward" else (plan, pi)
+            here.setdefault("kl", []).append(torch.distributions.kl_divergence(*pair).mean(-1))
+            here.setdefault("entropy", []).append(pi.entropy().sum(-1))
+        here["value_target"] = [target]
+        for name, values in here.items():
+            errors.setdefault(name, []).append(sum(values) / len(values))
+    return {name: torch.stack(values, 1) for name, values in errors.items()}
+
+
+def _network(weights: dict[str, Tensor], x: Tensor, *, hidden: int, member: int | None = None) -> Tensor:
+    def take(name: str) -> Tensor:
+        return weights[name] if member is None else weights[name][member]
+
+    def normed(layer: str, x: Tensor) -> Tensor:
+        x = x @ take(f"{layer}.weight") + take(f"{layer}.bias")
+        x = (x - x.mean(-1, keepdim=True)) / torch.sqrt(x.var(-1, keepdim=True, unbiased=False) + 1e-5)
+        return x * take(f"{layer}.norm_weight") + take(f"{layer}.norm_bias")
+
+    for layer in range(hidden):
+        x = normed(f"hidden.{layer}", x)
+        x = x * torch.tanh(torch.log(1 + torch.exp(x)))
+    if "output.norm_weight" in weights:
+        return normed("output", x)
+    return x @ take("output.weight") + take("output.bias")
+
+
+def _simnorm(x: Tensor, group_size: int) -> Tensor:
+    out = torch.empty_like(x)
+    num_groups = x.shape[-1] // group_size
+    for g in range(num_groups):
+        e = torch.exp(x[..., g::num_groups])
+        out[..., g::num_groups] = e / e.sum(-1, keepdim=True)
+    return out
+
+
+def _expected(logits: Tensor, bins: Tensor) -> Tensor:
+    e = torch.exp(logits)
+    x = (e / e.sum(-1, keepdim=True) * bins).sum(-1)
+    return torch.where(x < 0, 1 - torch.exp(-x), torch.exp(x) - 1)
+
+
+def _cross_entropy(logits: Tensor, target: Tensor, bins: Tensor) -> Tensor:
+    log_probabilities = logits - torch.log(torch.exp(logits).sum(-1, keepdim=True))
+    out = []
+    for row, scalar in zip(log_probabilities, target.tolist(), strict=True):
+        squashed = math.copysign(math.log(1 + abs(scalar)), scalar)
+        position = (squashed - bins[0].item()) / (bins[1] - bins[0]).item()
+        position = min(max(position, 0.0), len(bins) - 1.0)
+        lower = min(int(position), len(bins) - 2)
+        share = position - lower
+        out.append(-(1 - share) * row[lower] - share * row[lower + 1])
+    return torch.stack(out)
+
+
+def set_constant_policy(world_model: WorldModel, mean: Tensor, std: Tensor) -> None:
+    """Makes the policy the same Gaussian at every latent."""
+    low, high = world_model.policy.log_std_bounds
+    raw = torch.atanh((std.log() - low) * 2 / (high - low) - 1)
+    with torch.no_grad():
+        world_model.policy.output.weight.zero_()
+        world_model.policy.output.bias.copy_(torch.cat([torch.atanh(mean), raw]))
+
+
+@pytest.fixture
+def constant_policy() -> Callable[[WorldModel, Tensor, Tensor], None]:
+    """See :func:`set_constant_policy`."""
+    return set_constant_policy
+
+
+@pytest.fixture
+def networks() -> Callable[[WorldModel], dict[str, nn.Module]]:
+    """The networks of a world model by the names that the losses give them."""
+
+    def by_name(world_model: WorldModel) -> dict[str, nn.Module]:
+        return {name.removesuffix("_head"): network for name, network in world_model.named_children()}
+
+    return by_name

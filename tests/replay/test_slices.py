@@ -1,0 +1,471 @@
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chisquare
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ListStorage,
+    RandomSampler,
+    TensorDictReplayBuffer,
+    TensorDictRoundRobinWriter,
+)
+from torchrl.envs import SerialEnv
+from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
+
+from torchrl_etdmpc import StepSliceSampler
+
+TRAJ_KEY = ("collector", "traj_ids")
+
+
+class Ring:
+    """A replay buffer next to a plain list of everything that was ever written to it."""
+
+    def __init__(self, capacity: int, slice_len: int, storage=LazyTensorStorage, **options) -> None:
+        self.capacity, self.slice_len = capacity, slice_len
+        self.sampler = StepSliceSampler(slice_len, **options)
+        self.buffer = TensorDictReplayBuffer(
+            storage=storage(capacity), sampler=self.sampler, writer=TensorDictRoundRobinWriter(track_generations=True)
+        )
+        self.history: list[tuple[int, int]] = []
+
+    def write(self, rows: list[tuple[int, int]], *, one_by_one: bool = False) -> None:
+        data = TensorDict(
+            {
+                "t": torch.tensor([step for _, step in rows]),
+                "collector": {"traj_ids": torch.tensor([trajectory for trajectory, _ in rows])},
+            },
+            [len(rows)],
+        )
+        if one_by_one:
+            for row in data.unbind(0):
+                self.buffer.add(row)
+        else:
+            self.buffer.extend(data)
+        self.history.extend(rows)
+
+    def every_valid_slice(self) -> set[tuple[int, ...]]:
+        """Brute force: the windows of each trajectory's stored rows, as storage indices."""
+        stored = defaultdict(list)
+        for count in range(max(0, len(self.history) - self.capacity), len(self.history)):
+            stored[self.history[count][0]].append(count % self.capacity)
+        windows = range(self.slice_len)
+        return {
+            tuple(rows[first + k] for k in windows)
+            for rows in stored.values()
+            for first in range(len(rows) - self.slice_len + 1)
+        }
+
+    def draw(self, number: int) -> np.ndarray:
+        index, _ = self.sampler.sample(self.buffer.storage, number * self.slice_len)
+        return index.reshape(number, self.slice_len).numpy()
+
+    def every_drawn_slice(self) -> set[tuple[int, ...]]:
+        """What thousands of draws find: each valid slice is missed with a probability below e-40."""
+        valid = self.every_valid_slice()
+        if not valid:
+            with pytest.raises(RuntimeError, match=f"has {self.slice_len} steps yet"):
+                self.draw(1)
+            assert not self.sampler.can_sample(self.buffer.storage, self.slice_len)
+            return set()
+        assert self.sampler.can_sample(self.buffer.storage, self.slice_len)
+        trajectories = len({trajectory for trajectory, _ in self.history[-self.capacity :]})
+        return {tuple(rows) for rows in np.unique(self.draw(40 * trajectories * self.capacity), axis=0).tolist()}
+
+
+def interleaved(lengths: list[int], num_envs: int, rows: int, first: int = 0) -> list[tuple[int, int]]:
+    """Rows as StepCollector writes them: one step of every environment in turn, episodes of the given lengths."""
+    lengths, ids = itertools.cycle(lengths), itertools.count(first)
+    running = [[next(ids), 0, next(lengths)] for _ in range(num_envs)]
+    out = []
+    while len(out) < rows:
+        for env in running:
+            if env[1] == env[2]:
+                env[:] = [next(ids), 0, next(lengths)]
+            out.append((env[0], env[1]))
+            env[1] += 1
+    return out[:rows]
+
+
+def contiguous(lengths: list[int], rows: int) -> list[tuple[int, int]]:
+    """Whole episodes one after the other."""
+    return interleaved(lengths, 1, rows)
+
+
+@settings(max_examples=120, deadline=None, database=None, derandomize=True)
+@given(
+    lengths=st.lists(st.integers(1, 12), min_size=1, max_size=8),
+    num_envs=st.integers(1, 4),
+    capacity=st.integers(1, 30),
+    slice_len=st.integers(1, 5),
+    uniform_over=st.sampled_from(["episodes", "starts"]),
+    chunks=st.lists(st.tuples(st.integers(1, 20), st.booleans(), st.booleans()), min_size=1, max_size=14),
+)
+def test_the_slices_that_can_be_drawn_are_exactly_the_valid_ones(
+    lengths, num_envs, capacity, slice_len, uniform_over, chunks
+):
+    ring = Ring(capacity, slice_len, uniform_over=uniform_over)
+    rows = interleaved(lengths, num_envs, sum(size for size, _, _ in chunks))
+    for size, one_by_one, look in [*chunks, (0, False, True)]:
+        for begin in range(0, size, capacity):
+            ring.write(rows[: min(capacity, size - begin)], one_by_one=one_by_one)
+            rows = rows[min(capacity, size - begin) :]
+        if look:
+            assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("capacity", [60, 61, 67])
+def test_no_slice_of_a_full_ring_crosses_a_border_or_the_write_head(capacity, num_envs):
+    ring = Ring(capacity, 4)
+    ring.write(interleaved([10], num_envs, 60))
+    for row in interleaved([10], num_envs, 90, first=1000):
+        ring.write([row])
+        sample = ring.buffer.sample(400).reshape(-1, 4)
+        assert (sample["t"].diff() == 1).all()
+        assert (sample[TRAJ_KEY] == sample[TRAJ_KEY][:, :1]).all()
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_a_trajectory_that_fills_the_whole_ring_is_never_cut_at_the_write_head():
+    ring = Ring(10, 3)
+    for step in range(37):
+        ring.write([(0, step)])
+        if step >= 2:
+            assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_rows_that_arrive_unseen_by_a_sample_more_than_once_round_the_ring_are_followed():
+    ring = Ring(8, 2)
+    ring.write([(0, 0)])
+    ring.write([(1, 0), (1, 1), (1, 2)])
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+    ring.write([(0, step) for step in range(1, 8)])
+    ring.write([(0, step) for step in range(8, 15)])
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_the_running_episode_can_be_sampled_from_its_first_complete_slice_on():
+    ring = Ring(50, 3)
+    for step in range(2):
+        ring.write([(7, step)])
+        with pytest.raises(RuntimeError, match="no trajectory in the buffer has 3 steps yet"):
+            ring.buffer.sample(3)
+    ring.write([(7, 2)])
+    assert ring.buffer.sample(6)["t"].tolist() == [0, 1, 2, 0, 1, 2]
+
+
+def test_one_trajectory_that_goes_on_with_another_stride_is_never_joined_wrongly():
+    ring = Ring(40, 3)
+    ring.write([(0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2)])
+    ring.write([(0, step) for step in range(3, 8)])
+    drawn = ring.every_drawn_slice()
+    assert drawn <= ring.every_valid_slice()
+    assert {(0, 2, 4), (7, 8, 9), (8, 9, 10)} <= drawn
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_batches_of_a_torchrl_collector_are_sliced_within_trajectories(num_envs):
+    limits = [4, 6, 9][:num_envs]
+    env = SerialEnv(num_envs, [lambda limit=limit: CountingEnv(max_steps=limit) for limit in limits])
+    collector = Collector(
+        env,
+        CountingEnvCountPolicy(env.action_spec),
+        frames_per_batch=5 * num_envs,
+        total_frames=60 * num_envs,
+        auto_register_policy_transforms=False,
+    )
+    flat, turned = Ring(50 * num_envs, 3), Ring(50 * num_envs, 3)
+    for batch in collector:
+        batch = batch.select("observation", TRAJ_KEY)
+        assert batch.shape == (num_envs, 5)
+        for ring, rows in ((flat, batch.reshape(-1)), (turned, batch.transpose(0, 1).reshape(-1))):
+            ring.write(list(zip(rows[TRAJ_KEY].tolist(), rows["observation"].flatten().tolist(), strict=True)))
+    collector.shutdown()
+    for ring in (flat, turned):
+        sample = ring.buffer.sample(9000).reshape(-1, 3)
+        assert (sample["t"].diff() == 1).all()
+        assert (sample[TRAJ_KEY] == sample[TRAJ_KEY][:, :1]).all()
+    assert flat.every_drawn_slice() <= flat.every_valid_slice()
+    assert turned.every_drawn_slice() == turned.every_valid_slice()
+    if num_envs == 1:
+        assert flat.every_drawn_slice() == flat.every_valid_slice()
+
+
+@pytest.mark.parametrize("num_slices", [1, 7])
+@pytest.mark.parametrize("slice_len", [1, 4])
+def test_a_sample_holds_exactly_batch_size_over_slice_len_slices(slice_len, num_slices):
+    ring = Ring(30, slice_len)
+    ring.write(contiguous([6], 30))
+    sample = ring.buffer.sample(num_slices * slice_len)
+    assert sample.batch_size == (num_slices * slice_len,)
+    assert (sample.reshape(-1, slice_len)["t"].diff() == 1).all()
+
+
+def test_slices_of_one_step_are_single_rows():
+    ring = Ring(10, 1, uniform_over="starts")
+    ring.write(contiguous([1, 2, 3], 17))
+    assert {rows[0] for rows in ring.every_drawn_slice()} == set(range(10))
+
+
+def _is_uniform(counts: np.ndarray) -> bool:
+    return len(counts) == 1 or bool(chisquare(counts).pvalue > 1e-4)
+
+
+def test_trajectories_are_drawn_uniformly_and_then_starts_within_them():
+    torch.manual_seed(0)
+    ring = Ring(100, 3)
+    lengths = [3, 8, 30]
+    ring.write([(trajectory, step) for trajectory, length in enumerate(lengths) for step in range(length)])
+    first = ring.draw(9000)[:, 0]
+    borders = np.cumsum([0, *lengths])
+    assert _is_uniform(np.histogram(first, borders)[0])
+    for begin, length in zip(borders[:-1], lengths, strict=True):
+        within = first[(first >= begin) & (first < begin + length)] - begin
+        assert _is_uniform(np.bincount(within, minlength=length - 2))
+
+
+def test_starts_are_drawn_uniformly_whatever_their_trajectory():
+    torch.manual_seed(0)
+    ring = Ring(100, 3, uniform_over="starts")
+    lengths = [3, 8, 30]
+    ring.write([(trajectory, step) for trajectory, length in enumerate(lengths) for step in range(length)])
+    counts = np.bincount(ring.draw(9000)[:, 0], minlength=100)
+    valid = sorted(rows[0] for rows in ring.every_valid_slice())
+    assert counts.sum() == counts[valid].sum() == 9000
+    assert _is_uniform(counts[valid])
+
+
+@pytest.mark.parametrize(("uniform_over", "share"), [("episodes", 1 / 5), ("starts", 2 / 194)])
+def test_the_running_episode_is_favoured_by_drawing_episodes_but_not_by_drawing_starts(uniform_over, share):
+    torch.manual_seed(0)
+    ring = Ring(500, 3, uniform_over=uniform_over)
+    ring.write([(trajectory, step) for trajectory in range(4) for step in range(50)])
+    ring.write([(4, step) for step in range(4)])
+    drawn = (ring.draw(20_000)[:, 0] >= 200).mean()
+    assert drawn == pytest.approx(share, rel=0.15)
+
+
+def _through_state_dict(ring: Ring, fresh: Ring, path) -> None:
+    torch.save(ring.buffer.state_dict(), path / "buffer.pt")
+    fresh.buffer.load_state_dict(torch.load(path / "buffer.pt", weights_only=False))
+
+
+def _through_dumps(ring: Ring, fresh: Ring, path) -> None:
+    ring.buffer.dumps(path)
+    fresh.buffer.loads(path)
+
+
+@pytest.mark.parametrize("save_and_load", [_through_state_dict, _through_dumps])
+@pytest.mark.parametrize("looked", [True, False], ids=["sampled-before", "not-sampled-before"])
+@pytest.mark.parametrize("written", [14, 75], ids=["part", "full"])
+def test_a_loaded_buffer_is_sampled_and_goes_on_as_the_saved_one(tmp_path, written, looked, save_and_load):
+    rows = interleaved([7, 4, 11], 2, 150)
+    ring, fresh = Ring(23, 3), Ring(23, 3)
+    ring.write(rows[:written])
+    if looked:
+        ring.draw(1)
+    save_and_load(ring, fresh, tmp_path)
+    fresh.history = list(ring.history)
+    valid = ring.every_valid_slice()
+    assert ring.every_drawn_slice() == fresh.every_drawn_slice() == valid
+    torch.manual_seed(3)
+    expected = ring.draw(20)
+    torch.manual_seed(3)
+    assert (fresh.draw(20) == expected).all()
+    for begin in range(written, written + 60, 4):
+        fresh.write(rows[begin : begin + 4])
+        assert fresh.every_drawn_slice() == fresh.every_valid_slice()
+    assert ring.every_drawn_slice() == valid  # the saved one has not changed with it
+
+
+def test_a_snapshot_does_not_change_with_the_sampler():
+    ring = Ring(30, 2)
+    ring.write(contiguous([5], 12))
+    ring.draw(1)
+    snapshot = ring.sampler.state_dict()
+    before = snapshot["written"], snapshot["segments"].clone(), dict(snapshot["open"])
+    ring.write(contiguous([5], 60)[12:30])
+    ring.draw(1)
+    assert (snapshot["written"], snapshot["open"]) == (before[0], before[2])
+    assert torch.equal(snapshot["segments"], before[1])
+
+
+def test_draws_are_reproducible_by_torch_manual_seed():
+    ring = Ring(60, 3)
+    ring.write(contiguous([10], 60))
+    torch.manual_seed(1)
+    first = ring.draw(50)
+    assert (ring.draw(50) != first).any()
+    torch.manual_seed(1)
+    assert (ring.draw(50) == first).all()
+
+
+def test_a_generator_of_the_buffer_is_the_only_source_of_randomness():
+    ring = Ring(60, 3)
+    ring.write(contiguous([10], 60))
+    ring.buffer.set_rng(torch.Generator().manual_seed(1))
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    first = ring.draw(50)
+    assert torch.equal(torch.get_rng_state(), state)
+    ring.buffer.set_rng(torch.Generator().manual_seed(1))
+    assert (ring.draw(50) == first).all()
+
+
+def test_an_emptied_buffer_starts_afresh():
+    ring = Ring(12, 3)
+    ring.write(contiguous([5], 31))
+    ring.draw(1)
+    ring.buffer.empty()
+    ring.history.clear()
+    assert ring.every_drawn_slice() == set()
+    for row in contiguous([4], 17):
+        ring.write([row])
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_rows_added_one_by_one_equal_rows_written_at_once():
+    rows = interleaved([5, 3], 2, 40)
+    together, apart = Ring(17, 3), Ring(17, 3)
+    apart.write(rows, one_by_one=True)
+    for begin in range(0, 40, 8):
+        together.write(rows[begin : begin + 8])
+    assert apart.every_drawn_slice() == together.every_drawn_slice() == apart.every_valid_slice()
+
+
+def test_a_memory_mapped_storage_is_sampled_like_one_in_memory(tmp_path):
+    ring = Ring(17, 3, storage=lambda capacity: LazyMemmapStorage(capacity, scratch_dir=tmp_path))
+    for row in interleaved([5, 8], 2, 44):
+        ring.write([row])
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_the_trajectory_id_may_have_another_key_and_a_trailing_dimension():
+    sampler = StepSliceSampler(2, traj_key=("data", "episode"))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=sampler, batch_size=200)
+    ids = torch.tensor([0, 0, 0, 1, 1, 2, 2, 2]).unsqueeze(-1)
+    buffer.extend(TensorDict({"data": {"episode": ids}, "t": torch.arange(8)}, [8]))
+    sample = buffer.sample().reshape(-1, 2)
+    assert {tuple(pair) for pair in sample["t"].tolist()} == {(0, 1), (1, 2), (3, 4), (5, 6), (6, 7)}
+
+
+def test_a_sample_may_be_asked_for_after_writing_a_reanalyzed_target():
+    ring = Ring(20, 3)
+    ring.write(contiguous([5], 20))
+    sample = ring.buffer.sample(6)
+    ring.buffer.update_if_present(
+        index=sample["index"], generation=sample["index_generation"], patch={"t": sample["t"] + 100}
+    )
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_a_row_is_read_once_however_often_the_buffer_is_sampled():
+    ring = Ring(20, 3)
+    ring.write(contiguous([5], 20))
+    ring.draw(1)
+    ring.buffer.storage[:][TRAJ_KEY].fill_(-1)  # what a sampler that reads the column again would trip over
+    ring.write(contiguous([5], 23)[20:])
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def _table_size(sampler: StepSliceSampler) -> int:
+    state = sampler.state_dict()
+    return max(state["segments"].shape[1], len(state["open"]))
+
+
+def test_the_table_of_trajectories_stays_bounded_after_thousands_of_evicted_ones():
+    ring = Ring(60, 3)
+    rows = contiguous([3], 6000)
+    sizes = []
+    for begin in range(0, 6000, 20):
+        ring.write(rows[begin : begin + 20])
+        ring.draw(1)
+        sizes.append(_table_size(ring.sampler))
+    assert max(sizes) < 150  # 21 trajectories fit into the ring
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_one_endless_trajectory_does_not_keep_the_table_from_shrinking():
+    ring = Ring(60, 3)
+    rows = [row for step in range(3000) for row in ((0, step), (1 + step // 3, step % 3))]
+    for begin in range(0, 6000, 30):
+        ring.write(rows[begin : begin + 30])
+        ring.draw(1)
+    assert _table_size(ring.sampler) < 150
+    assert ring.every_drawn_slice() == ring.every_valid_slice()
+
+
+def test_a_batch_size_that_is_no_multiple_of_the_slice_is_refused():
+    ring = Ring(20, 3)
+    ring.write(contiguous([5], 20))
+    with pytest.raises(ValueError, match=r"batch_size must be a multiple of slice_len=3, got 7"):
+        ring.buffer.sample(7)
+
+
+def test_rows_without_a_trajectory_id_are_refused():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=StepSliceSampler(3), batch_size=6)
+    buffer.extend(TensorDict({"t": torch.arange(9)}, [9]))
+    with pytest.raises(KeyError, match=r"needs the trajectory id \('collector', 'traj_ids'\) in every row"):
+        buffer.sample()
+
+
+def _write_rows(buffer: TensorDictReplayBuffer, number: int) -> None:
+    buffer.extend(TensorDict({"collector": {"traj_ids": torch.zeros(number, dtype=torch.int64)}}, [number]))
+
+
+def test_a_sampler_that_missed_the_first_writes_is_refused():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=RandomSampler(), batch_size=6)
+    _write_rows(buffer, 7)
+    buffer.set_sampler(StepSliceSampler(3))
+    with pytest.raises(RuntimeError, match="attach the sampler before the first write"):
+        buffer.sample()
+
+
+def test_a_sampler_that_missed_the_first_writes_is_refused_even_if_it_saw_a_whole_ring_since():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=RandomSampler(), batch_size=6)
+    _write_rows(buffer, 7)
+    buffer.set_sampler(StepSliceSampler(3))
+    for number in (4, 6):
+        _write_rows(buffer, number)
+    with pytest.raises(RuntimeError, match="attach the sampler before the first write"):
+        buffer.sample()
+
+
+def test_a_storage_loaded_without_its_sampler_is_refused(tmp_path):
+    ring, fresh = Ring(20, 3), Ring(20, 3)
+    ring.write(contiguous([5], 12))
+    ring.buffer.storage.dumps(tmp_path)
+    fresh.buffer.storage.loads(tmp_path)
+    with pytest.raises(RuntimeError, match="save and load it together with the storage"):
+        fresh.draw(1)
+
+
+@pytest.mark.parametrize("storage", [ListStorage(20), LazyTensorStorage(20, ndim=2)], ids=["list", "two-dimensional"])
+def test_a_storage_that_is_no_flat_tensor_storage_is_refused(storage):
+    buffer = TensorDictReplayBuffer(storage=storage, sampler=StepSliceSampler(3), batch_size=6)
+    data = TensorDict({"collector": {"traj_ids": torch.zeros(2, 6, dtype=torch.int64)}}, [2, 6])
+    buffer.extend(data if storage.ndim == 2 else data.reshape(-1))
+    with pytest.raises(TypeError, match="StepSliceSampler needs a one-dimensional tensor storage"):
+        buffer.sample()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"slice_len": 0}, "slice_len must be at least 1, got 0"),
+        ({"slice_len": 3, "uniform_over": "rows"}, "uniform_over must be 'episodes' or 'starts', got 'rows'"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        StepSliceSampler(**arguments)
