@@ -124,6 +124,16 @@ def assert_same_output() -> Callable[..., None]:
 
 
 @pytest.fixture
+def networks() -> Callable[[WorldModel], dict[str, nn.Module]]:
+    """The networks of a world model by the names that the losses give them."""
+
+    def by_name(world_model: WorldModel) -> dict[str, nn.Module]:
+        return {name.removesuffix("_head"): network for name, network in world_model.named_children()}
+
+    return by_name
+
+
+@pytest.fixture
 def gradients() -> Callable[[Tensor, WorldModel], dict[str, dict[str, Tensor | None]]]:
     """Gradients of a scalar by network and parameter; ``None`` where the graph does not reach."""
 
@@ -137,6 +147,20 @@ def gradients() -> Callable[[Tensor, WorldModel], dict[str, dict[str, Tensor | N
         return by_network
 
     return compute
+
+
+@pytest.fixture
+def constant_policy() -> Callable[[WorldModel, Tensor, Tensor], None]:
+    """Makes the policy the same Gaussian at every latent."""
+
+    def make_constant(world_model: WorldModel, mean: Tensor, std: Tensor) -> None:
+        low, high = world_model.policy.log_std_bounds
+        raw = torch.atanh((std.log() - low) * 2 / (high - low) - 1)
+        with torch.no_grad():
+            world_model.policy.output.weight.zero_()
+            world_model.policy.output.bias.copy_(torch.cat([torch.atanh(mean), raw]))
+
+    return make_constant
 
 
 @pytest.fixture
@@ -166,7 +190,7 @@ def _disturb(tensors) -> None:
 
 
 def _plain_errors(
-    loss: LossModule, slices: TensorDict, noise: Tensor, *, kl_direction: str = "backward"
+    loss: LossModule, slices: TensorDict, noise: Tensor, *, discount: float = 0.9, kl_direction: str = "backward"
 ) -> dict[str, Tensor]:
     """Unweighted errors ``[B, T]`` with gradient, without dropout.
 
@@ -174,6 +198,7 @@ def _plain_errors(
         loss (LossModule): the weights; the targets are the value heads' own where the loss has none.
         slices (TensorDict): ``[B, T]``.
         noise (Tensor): the policy's noise in the value targets, ``[T, B, A]``.
+        discount (float): of the value targets.
         kl_direction (str): as in the loss.
     """
     world_model = loss.world_model
@@ -228,7 +253,7 @@ def _plain_errors(
                 for j in range(num_values):
                     value = _expected(_network(target_values, imagined, hidden=2, member=j), bins)
                     future = future + alive * value / (num_dynamics * num_values)
-            target = _expected(reward_logits(encoded[k], imagined_action), bins) + float(loss.discount) * future
+            target = _expected(reward_logits(encoded[k], imagined_action), bins) + discount * future
         here: dict[str, list[Tensor]] = {}
         for i in range(num_dynamics):
             latent, successor = rollouts[i][k], rollouts[i][k + 1]
@@ -297,28 +322,3 @@ def _cross_entropy(logits: Tensor, target: Tensor, bins: Tensor) -> Tensor:
         share = position - lower
         out.append(-(1 - share) * row[lower] - share * row[lower + 1])
     return torch.stack(out)
-
-
-def set_constant_policy(world_model: WorldModel, mean: Tensor, std: Tensor) -> None:
-    """Makes the policy the same Gaussian at every latent."""
-    low, high = world_model.policy.log_std_bounds
-    raw = torch.atanh((std.log() - low) * 2 / (high - low) - 1)
-    with torch.no_grad():
-        world_model.policy.output.weight.zero_()
-        world_model.policy.output.bias.copy_(torch.cat([torch.atanh(mean), raw]))
-
-
-@pytest.fixture
-def constant_policy() -> Callable[[WorldModel, Tensor, Tensor], None]:
-    """See :func:`set_constant_policy`."""
-    return set_constant_policy
-
-
-@pytest.fixture
-def networks() -> Callable[[WorldModel], dict[str, nn.Module]]:
-    """The networks of a world model by the names that the losses give them."""
-
-    def by_name(world_model: WorldModel) -> dict[str, nn.Module]:
-        return {name.removesuffix("_head"): network for name, network in world_model.named_children()}
-
-    return by_name

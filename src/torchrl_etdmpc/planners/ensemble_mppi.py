@@ -42,8 +42,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     and the target's mean comes from ``first_action``; otherwise the action is the mean from ``eval_first_action``.
 
     The warm start travels in the tensordict: append :meth:`make_tensordict_primer` to the environment, which zeroes it
-    at every reset, or an ``InitTracker`` whose ``is_init`` the planner obeys. With neither of the two in the input the
-    planner starts cold at every step and warns once.
+    at every reset and without which rollouts and collectors drop it. Where the input holds an ``InitTracker``'s
+    ``is_init``, a plan is zeroed at the start of its episode in any case. With no plan in the input the planner starts
+    cold, and warns once unless all episodes have just begun.
 
     Args:
         env (LatentEnv): the world model as an environment.
@@ -228,17 +229,17 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             return None, False
         carried = tensordict.get(self.plan_mean_key, None)
         is_init = tensordict.get(self.is_init_key, None)
-        if carried is not None and is_init is not None:
-            carried = torch.where(is_init.unsqueeze(-1), torch.zeros_like(carried), carried)
-        if carried is None and is_init is None:
-            if not self._warned_cold:
+        if carried is None:
+            if not self._warned_cold and (is_init is None or not is_init.all()):
                 self._warned_cold = True
                 warnings.warn(
-                    f"neither {self.plan_mean_key!r} nor {self.is_init_key!r} is in the planner's input, so every plan "
-                    "starts cold; append planner.make_tensordict_primer() to the environment or pass warm_start=False.",
+                    f"{self.plan_mean_key!r} is not in the planner's input, so every plan starts cold; append "
+                    "planner.make_tensordict_primer() to the environment or pass warm_start=False.",
                     stacklevel=3,
                 )
-            return None, False
+            return None, is_init is not None
+        if is_init is not None:
+            carried = torch.where(is_init.unsqueeze(-1), torch.zeros_like(carried), carried)
         return carried, True
 
     def draw_noise(self, *batch_size: int, generator: torch.Generator | None = None) -> PlanNoise:

@@ -11,16 +11,16 @@ from typing import Any
 from torchrl_etdmpc.training.config import PRESETS, TrainConfig, config_from_dict, preset
 
 
-def one_line_errors(main: Callable[[], None]) -> Callable[[], None]:
+def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
     """Makes a command end in one line on stderr and exit code 1 for any error that a user can mend.
 
     ``TORCHRL_ETDMPC_TRACEBACK=1`` shows the traceback instead.
     """
 
     @functools.wraps(main)
-    def wrapped() -> None:
+    def wrapped(*args: Any) -> None:
         try:
-            main()
+            main(*args)
         except KeyboardInterrupt:
             sys.exit(130)
         except Exception as error:

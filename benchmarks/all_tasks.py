@@ -1,0 +1,132 @@
+"""All 28 DMC tasks with a preset at full size: build, collect, plan, reanalyze and update for a handful of steps.
+
+    python benchmarks/all_tasks.py                              # about fifteen minutes on two cores
+    python benchmarks/all_tasks.py --tasks dog-run humanoid-run --preset bmpc
+
+Checks that everything is finite and prints a row per task; writes `benchmarks/results/<device>/all_tasks.csv`. Exits
+with 1 if a task fails. Times are of the first call, in eager mode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import math
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("MUJOCO_GL", "disable")
+
+import torch  # noqa: E402
+
+from torchrl_etdmpc.envs import DMC_TASKS, make_dmc_env  # noqa: E402
+from torchrl_etdmpc.training import (  # noqa: E402
+    build_agent,
+    build_collector,
+    build_reanalyze,
+    build_replay,
+    preset,
+    resolve_device,
+)
+
+ROOT = Path(__file__).resolve().parent.parent
+COLUMNS = ("task", "observation", "action", "iterations", "parameters", "plan_s", "reanalyze_s", "update_s", "loss")
+SEED_DECISIONS = 30
+
+
+def timed(device: torch.device, function):
+    """The result and the seconds it took."""
+    start = time.perf_counter()
+    result = function()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return result, time.perf_counter() - start
+
+
+def exercise(task: str, preset_name: str, device: torch.device) -> dict[str, object]:
+    """A handful of steps of one task.
+
+    Raises:
+        RuntimeError: if a loss, a gradient norm or a weight is not finite, or a target was not refreshed.
+    """
+    base = preset(preset_name)
+    replay_config = dataclasses.replace(base.replay, seed_decisions=SEED_DECISIONS, insertion="step")
+    config = dataclasses.replace(base, task=task, compile="off", total_env_steps=1000, replay=replay_config)
+    torch.manual_seed(0)
+    env = make_dmc_env(task, seed=0)
+    sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+    agent = build_agent(config, *sizes, device)
+    replay = build_replay(config, device)
+    reanalyze = build_reanalyze(config, agent, replay)
+    collector = build_collector(config, agent, env, replay)
+    reanalyze.enabled = False
+    for _ in range(SEED_DECISIONS):
+        collector.step()
+
+    def update(*, distill: bool):
+        batch = replay.sample().to(device).reshape(-1, config.loss.slice_len)
+        return agent.updater.step(batch, distill=distill)
+
+    update(distill=False)  # pretraining
+    _, plan_s = timed(device, collector.step)
+    batch, reanalyze_s = timed(device, lambda: reanalyze.refresh(replay.sample()))
+    metrics, update_s = timed(
+        device, lambda: agent.updater.step(batch.to(device).reshape(-1, config.loss.slice_len), distill=True)
+    )
+    collector.shutdown()
+    values = {name: float(value) for name, value in metrics.items()}
+    broken = [name for name, value in values.items() if not math.isfinite(value)]
+    broken += [name for name, weight in agent.world_model.named_parameters() if not weight.isfinite().all()]
+    if broken:
+        raise RuntimeError(f"not finite: {', '.join(broken)}")
+    if reanalyze.refreshed == 0 or reanalyze.stale:
+        raise RuntimeError(f"reanalyze refreshed {reanalyze.refreshed} targets and found {reanalyze.stale} stale")
+    return {
+        "task": task,
+        "observation": sizes[0],
+        "action": sizes[1],
+        "iterations": agent.planner.iterations,
+        "parameters": sum(parameter.numel() for parameter in agent.world_model.parameters()),
+        "plan_s": round(plan_s, 3),
+        "reanalyze_s": round(reanalyze_s, 3),
+        "update_s": round(update_s, 3),
+        "loss": round(sum(value for name, value in values.items() if name.startswith("loss_")), 4),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=list(DMC_TASKS))
+    parser.add_argument("--preset", default="efficient-tdmpc-utd4")
+    parser.add_argument("--device", default="auto")
+    arguments = parser.parse_args()
+    device = resolve_device(arguments.device)
+    name = "cpu" if device.type == "cpu" else torch.cuda.get_device_name(device).lower().replace(" ", "-")
+    path = ROOT / "benchmarks" / "results" / name / "all_tasks.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    failed = 0
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        print(" ".join(f"{column:>12}" for column in COLUMNS))
+        for task in arguments.tasks:
+            try:
+                row = exercise(task, arguments.preset, device)
+            except Exception as error:  # the point is to see which of the tasks fail
+                failed += 1
+                print(f"{task}: {type(error).__name__}: {error}", flush=True)
+                continue
+            writer.writerow(row)
+            file.flush()
+            print(" ".join(f"{row[column]!s:>12}" for column in COLUMNS), flush=True)
+    print(
+        f"{len(arguments.tasks) - failed} of {len(arguments.tasks)} tasks passed; rows are in {path.relative_to(ROOT)}"
+    )
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""Learning runs of the cpu preset: every task and seed, two at a time with one thread each, and one figure.
+
+    python benchmarks/cpu_learning.py                        # the committed runs (about two hours on two cores)
+    python benchmarks/cpu_learning.py --tasks walker-stand --seeds 1
+    python benchmarks/cpu_learning.py --figure-only          # redraw from the committed files
+
+Writes `benchmarks/results/cpu/<task>/seed<k>/{eval.csv,summary.json}`, `curves.png` and `README.md`. A run that is
+there already is kept; remove its folder to repeat it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import pandas as pd  # noqa: E402
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results" / "cpu"
+TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch")
+SEEDS = (1, 2, 3)
+ENV_STEPS = 50_000
+BLUE = "#0072B2"
+
+
+def run(task: str, seed: int, env_steps: int) -> str:
+    """One run in a process of its own; returns a line for the terminal."""
+    target = RESULTS / task / f"seed{seed}"
+    if (target / "summary.json").exists():
+        return f"{task} seed {seed}: already there"
+    with tempfile.TemporaryDirectory() as folder:
+        run_dir = Path(folder) / "run"
+        command = [sys.executable, str(ROOT / "examples" / "train_dmc.py"), "preset=cpu", f"task={task}"]
+        command += [f"seed={seed}", f"total_env_steps={env_steps}", f"run_dir={run_dir}"]
+        result = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
+        if result.returncode:
+            return f"{task} seed {seed}: failed: {result.stderr.strip().splitlines()[-1]}"
+        target.mkdir(parents=True, exist_ok=True)
+        for name in ("eval.csv", "summary.json"):
+            shutil.copy(run_dir / name, target / name)
+    return result.stdout.strip().splitlines()[-1].split(";")[0] + f" (seed {seed})"
+
+
+def collect() -> pd.DataFrame:
+    """All committed rows: task, seed, env_steps, return_mean."""
+    tables = []
+    for file in sorted(RESULTS.glob("*/seed*/eval.csv")):
+        table = pd.read_csv(file)
+        table["task"], table["seed"] = file.parent.parent.name, int(file.parent.name.removeprefix("seed"))
+        tables.append(table)
+    if not tables:
+        sys.exit(f"error: no runs under {RESULTS}; run this script without --figure-only first.")
+    return pd.concat(tables)
+
+
+def draw(table: pd.DataFrame) -> None:
+    """One panel per task: every seed as a thin line, their mean as a thick one."""
+    tasks = [task for task in TASKS if task in set(table.task)] + sorted(set(table.task) - set(TASKS))
+    columns = min(len(tasks), 2)
+    rows = -(-len(tasks) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.5 * columns, 3 * rows), squeeze=False, sharey=True)
+    for axis in axes.flat[len(tasks) :]:
+        axis.remove()
+    for axis, task in zip(axes.flat, tasks, strict=False):
+        curves = table[table.task == task].pivot(index="env_steps", columns="seed", values="return_mean")
+        axis.plot(curves.index / 1000, curves, color=BLUE, alpha=0.35, linewidth=1)
+        axis.plot(curves.index / 1000, curves.mean(axis=1), color=BLUE, linewidth=2)
+        axis.set_title(f"{task} ({curves.shape[1]} seeds)")
+        axis.set_xlim(left=0)
+        axis.set_ylim(0, 1000)
+        axis.grid(alpha=0.3)
+        axis.set_xlabel("environment steps (thousands)")
+        axis.set_ylabel("episode return")
+    figure.tight_layout()
+    figure.savefig(RESULTS / "curves.png", dpi=150)
+
+
+def write_readme(table: pd.DataFrame) -> None:
+    """A table of returns, budgets and wall times."""
+    lines = [
+        "# Learning runs of the cpu preset",
+        "",
+        "Made by `python benchmarks/cpu_learning.py`: two runs at a time, one thread each. Return of the evaluation",
+        "(mean of 10 episodes, planner without noise) at the end of the budget; wall time includes seed phase,",
+        "compilation and evaluations.",
+        "",
+        "| task | env steps | seeds | final return: mean (each) | best mean of seeds | wall time, min | decisions/s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    versions = set()
+    for task, rows in table.groupby("task"):
+        summaries = [json.loads(file.read_text()) for file in sorted((RESULTS / task).glob("seed*/summary.json"))]
+        finals = [summary["final_return"] for summary in summaries]
+        curve = rows.groupby("env_steps").return_mean.mean()
+        walls = sorted(summary["wall_time_s"] / 60 for summary in summaries)
+        speeds = sorted(summary["decisions_per_second"] for summary in summaries)
+        versions |= {json.dumps(summary["versions"], sort_keys=True) for summary in summaries}
+        lines.append(
+            f"| {task} | {int(rows.env_steps.max())} | {len(finals)} | {sum(finals) / len(finals):.0f} "
+            f"({', '.join(f'{value:.0f}' for value in finals)}) | {curve.max():.0f} at {curve.idxmax()} "
+            f"| {walls[0]:.1f} to {walls[-1]:.1f} | {speeds[0]:.0f} to {speeds[-1]:.0f} |"
+        )
+    lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + ".", "", "![curves](curves.png)", ""]
+    (RESULTS / "README.md").write_text("\n".join(lines))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
+    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
+    parser.add_argument("--figure-only", action="store_true")
+    arguments = parser.parse_args()
+    if not arguments.figure_only:
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            runs = [(task, seed) for seed in arguments.seeds for task in arguments.tasks]
+            for line in pool.map(lambda pair: run(*pair, arguments.env_steps), runs):
+                print(line, flush=True)
+    table = collect()
+    draw(table)
+    write_readme(table)
+    print(f"figure and table are in {RESULTS.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

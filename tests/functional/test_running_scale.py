@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_etdmpc.functional import updated_scale
+
+
+def spread_of(batch: torch.Tensor) -> float:
+    low, high = np.percentile(batch.numpy(), [5, 95])
+    return high - low
+
+
+@pytest.mark.parametrize("size", [2, 7, 256, 1000])
+def test_with_rate_one_the_scale_is_the_spread_between_the_5th_and_the_95th_percentile(size):
+    batch = 10 * torch.randn(size, generator=torch.Generator().manual_seed(size), dtype=torch.float64)
+    scale = updated_scale(torch.tensor(3.0, dtype=torch.float64), batch, tau=1.0)
+    assert scale.item() == pytest.approx(max(spread_of(batch), 1.0), rel=1e-12)
+
+
+def test_with_rate_zero_the_scale_stays():
+    assert updated_scale(torch.tensor(7.0), torch.linspace(0, 1000, 11), tau=0.0) == 7
+
+
+def test_the_scale_is_an_exponential_moving_average():
+    batch = torch.linspace(0, 100, 101, dtype=torch.float64)  # spread 90
+    scale = torch.tensor(2.0, dtype=torch.float64)
+    expected = 2.0
+    for _ in range(5):
+        scale = updated_scale(scale, batch, tau=0.1)
+        expected = 0.9 * expected + 0.1 * 90
+        assert scale.item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_scale_approaches_a_constant_spread():
+    batch = torch.linspace(0, 100, 101)
+    scale = torch.tensor(1.0)
+    for _ in range(200):
+        scale = updated_scale(scale, batch, tau=0.1)
+    assert scale.item() == pytest.approx(90, rel=1e-4)
+
+
+def test_the_scale_is_never_below_one():
+    assert updated_scale(torch.tensor(1.0), torch.zeros(10), tau=1.0) == 1
+    assert updated_scale(torch.tensor(1.5), torch.full((10,), 42.0), tau=0.9) == 1
+
+
+def test_the_extreme_twentieths_of_the_batch_have_no_influence():
+    batch = torch.linspace(0, 100, 101)
+    wild = batch.clone()
+    wild[0], wild[-1] = -1e6, 1e6
+    assert updated_scale(torch.tensor(1.0), wild, 0.5) == updated_scale(torch.tensor(1.0), batch, 0.5)
+
+
+def test_the_scale_depends_on_neither_the_batchs_offset_nor_its_shape_nor_its_order():
+    batch = torch.linspace(0, 100, 120, dtype=torch.float64)
+    scale = torch.tensor(5.0, dtype=torch.float64)
+    expected = updated_scale(scale, batch, 0.3)
+    torch.testing.assert_close(updated_scale(scale, batch + 1e4, 0.3), expected)
+    assert torch.equal(updated_scale(scale, batch.flip(0).view(2, 3, 20), 0.3), expected)
+
+
+def test_no_gradient_passes_and_the_old_scale_is_left_alone():
+    old = torch.tensor(5.0)
+    batch = torch.linspace(0, 100, 101, requires_grad=True)
+    new = updated_scale(old, batch, 0.5)
+    assert not new.requires_grad
+    assert old == 5
+    assert new != 5
+    assert new.shape == ()
+
+
+def test_the_scale_keeps_its_own_dtype():
+    assert updated_scale(torch.tensor(1.0), torch.linspace(0, 9, 10, dtype=torch.float64), 0.5).dtype == torch.float32

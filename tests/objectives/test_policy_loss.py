@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Normal, kl_divergence
+
+from torchrl_etdmpc.objectives import distillation
+
+pytestmark = pytest.mark.usefixtures("double_precision")
+
+_MEAN = torch.tensor([0.9, -0.95, 0.2], dtype=torch.float64)
+_STD = torch.tensor([0.4, 0.1, 1.5], dtype=torch.float64)
+_RHO_MEAN = (1 + 0.5 + 0.25) / 3
+
+
+def _noise(slices, seed: int = 7):
+    """The policy noise that a loss draws after this seed."""
+    torch.manual_seed(seed)
+    return torch.randn_like(slices["action"].transpose(0, 1))
+
+
+def _set_plan(slices, loc, scale):
+    slices["plan", "loc"] = loc.expand(*slices.shape, 3).clone()
+    slices["plan", "scale"] = scale.expand(*slices.shape, 3).clone()
+
+
+@pytest.mark.parametrize("kind", ["policy", "whole"])
+@pytest.mark.parametrize("kl_direction", ["backward", "forward"])
+def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step(
+    make_loss, slices, plain_errors, depth_mean, kind, kl_direction
+):
+    loss = make_loss(kind, kl_direction=kl_direction, entropy_coef=0.05).eval()
+    loss.kl_scale.fill_(3.0)
+    errors = plain_errors(loss, slices, _noise(slices), kl_direction=kl_direction)
+    expected = depth_mean(errors["kl"] / 3.0 - 0.05 * 3 * errors["entropy"])
+    torch.testing.assert_close(loss(slices)["loss_policy"], expected)
+
+
+def test_the_gradient_is_that_of_the_plain_reference(
+    make_world_model, make_loss, slices, plain_errors, depth_mean, gradients
+):
+    world_model = make_world_model()
+    loss = make_loss("whole", world_model, entropy_coef=0.05).eval()
+    errors = plain_errors(loss, slices, _noise(slices))
+    expected = gradients(depth_mean(errors["kl"] - 0.05 * 3 * errors["entropy"]), world_model)
+    actual = gradients(loss(slices)["loss_policy"], world_model)
+    for name, gradient in expected["policy"].items():
+        torch.testing.assert_close(actual["policy"][name], gradient)
+    for network in expected.keys() - {"policy"}:
+        assert all(gradient is None for gradient in actual[network].values())
+
+
+def test_the_default_direction_is_backward(make_loss):
+    assert make_loss("policy").kl_direction == make_loss("whole").kl_direction == "backward"
+
+
+@pytest.mark.parametrize("kl_direction", [None, "backward", "forward"])
+def test_the_divergence_of_a_constant_policy_is_the_closed_form_of_its_direction(
+    make_world_model, make_loss, slices, constant_policy, kl_direction
+):
+    world_model = make_world_model()
+    constant_policy(world_model, _MEAN, _STD)
+    options = {} if kl_direction is None else {"kl_direction": kl_direction}
+    loss = make_loss("policy", world_model, entropy_coef=0.0, **options).eval()
+    _set_plan(slices, torch.tensor([0.1, 0.3, -0.5]), torch.tensor([0.7, 0.2, 0.3]))
+    pi, plan = Normal(_MEAN, _STD), Normal(torch.tensor([0.1, 0.3, -0.5]), torch.tensor([0.7, 0.2, 0.3]))
+    backward, forward = kl_divergence(pi, plan).mean(), kl_divergence(plan, pi).mean()
+    assert (backward - forward).abs() > 1
+    expected = forward if kl_direction == "forward" else backward
+    out = loss(slices)
+    torch.testing.assert_close(out["policy_kl"], expected)
+    torch.testing.assert_close(out["loss_policy"], _RHO_MEAN * expected)
+
+
+def test_the_divergence_is_a_mean_over_action_dimensions(make_world_model, make_loss, slices, constant_policy):
+    world_model = make_world_model()
+    constant_policy(world_model, _MEAN, _STD)
+    loss = make_loss("policy", world_model).eval()
+    _set_plan(slices, _MEAN, _STD * torch.tensor([1.0, 2.0, 1.0]))
+    one_dimension = math.log(2) + 1 / 8 - 1 / 2
+    torch.testing.assert_close(loss(slices)["policy_kl"].item(), one_dimension / 3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 17.0])
+@pytest.mark.parametrize("entropy_coef", [1e-4, 0.1])
+def test_a_policy_that_equals_the_plan_pays_the_entropy_times_its_coefficient_and_a_once(
+    make_world_model, make_loss, slices, constant_policy, scale, entropy_coef
+):
+    world_model = make_world_model()
+    constant_policy(world_model, _MEAN, _STD)
+    loss = make_loss("policy", world_model, entropy_coef=entropy_coef).eval()
+    loss.kl_scale.fill_(scale)
+    _set_plan(slices, _MEAN, _STD)
+    entropy = Normal(_MEAN, _STD).entropy().sum().item()
+    out = loss(slices)
+    torch.testing.assert_close(out["loss_policy"].item(), -entropy_coef * entropy * 3 * _RHO_MEAN)
+    torch.testing.assert_close(out["policy_entropy"].item(), entropy)
+    torch.testing.assert_close(out["policy_kl"].item(), 0.0)
+
+
+def test_the_default_entropy_coefficient_is_the_papers(make_loss):
+    for kind in ("policy", "whole"):
+        torch.testing.assert_close(make_loss(kind).entropy_coef.item(), 1e-4)
+
+
+def test_the_density_is_that_of_the_unclipped_gaussian_at_the_border_of_the_box(
+    make_world_model, make_loss, slices, constant_policy
+):
+    # Half of the mass of either Gaussian lies outside of [-1, 1]; no correction may notice.
+    world_model = make_world_model()
+    border = torch.tensor([0.999999, -0.999999, 0.999999])
+    constant_policy(world_model, border, torch.full((3,), 2.5))
+    loss = make_loss("policy", world_model, entropy_coef=0.1).eval()
+    _set_plan(slices, torch.tensor([1.0, -1.0, 1.0]), torch.full((3,), 2.0))
+    ratio = 2.5 / 2.0
+    divergence = -math.log(ratio) + ratio**2 / 2 - 1 / 2
+    entropy = 3 * (0.5 * math.log(2 * math.pi * math.e) + math.log(2.5))
+    expected = _RHO_MEAN * (divergence - 0.1 * 3 * entropy)
+    torch.testing.assert_close(loss(slices)["loss_policy"].item(), expected, rtol=1e-6, atol=0)
+
+
+def test_the_policy_is_read_at_the_latents_before_each_step(make_loss, slices):
+    # Observations after the first are never read; the last action leads to a latent that no policy term reads.
+    loss = make_loss("policy", reduction="none").eval()
+    before = loss(slices)["loss_policy"]
+    slices["next", "observation"] = torch.randn_like(slices["next", "observation"])
+    last = slices["action"].clone()
+    last[:, -1] *= -1
+    slices["action"] = last
+    torch.testing.assert_close(loss(slices)["loss_policy"], before, rtol=0, atol=0)
+    first = last.clone()
+    first[:, 0] *= -1
+    slices["action"] = first
+    after = loss(slices)["loss_policy"]
+    torch.testing.assert_close(after[:, 0], before[:, 0], rtol=0, atol=0)
+    assert (after[:, 1:] != before[:, 1:]).all()
+
+
+def test_every_head_contributes_its_own_latents(make_world_model, make_loss, slices):
+    world_model = make_world_model(num_dynamics=3)
+    loss = make_loss("policy", world_model, reduction="none").eval()
+    before = loss(slices)["loss_policy"]
+    for head in range(3):
+        with torch.no_grad():
+            world_model.dynamics.output.norm_bias[head].add_(torch.randn(16))
+        after = loss(slices)["loss_policy"]
+        assert (after[:, 1:] != before[:, 1:]).all()
+        before = after
+
+
+def test_the_policy_loss_sends_no_gradient_into_the_observations(make_loss, slices):
+    observation = slices["observation"].requires_grad_()
+    out = make_loss("policy")(slices)["loss_policy"]
+    assert torch.autograd.grad(out, [observation], allow_unused=True) == (None,)
+
+
+def test_distillation_detaches_the_latents_that_it_is_given(make_world_model, slices):
+    latent = torch.rand(3, 2, 4, 16, requires_grad=True)
+    out = distillation(make_world_model(), latent, *(slices["plan", key].transpose(0, 1) for key in ("loc", "scale")))
+    assert out.kl.shape == out.entropy.shape == (3, 2, 4)
+    assert torch.autograd.grad(out.kl.sum() + out.entropy.sum(), [latent], allow_unused=True) == (None,)
+
+
+def test_the_running_scale_follows_the_spread_of_the_first_steps_divergence(
+    make_world_model, make_loss, make_slices, plain_errors
+):
+    slices = make_slices(num_slices=30)
+    loss = make_loss("policy", make_world_model(num_dynamics=1), scale_tau=0.25)
+    first = plain_errors(loss, slices, _noise(slices))["kl"][:, 0].detach().numpy()
+    spread = np.percentile(first, 95) - np.percentile(first, 5)
+    assert spread > 2
+    expected = 1.0
+    for _ in range(3):
+        out = loss(slices)
+        expected += 0.25 * (spread - expected)
+        torch.testing.assert_close(out["kl_scale"].item(), expected)
+        torch.testing.assert_close(loss.kl_scale.item(), expected)
+
+
+def test_the_default_rate_of_the_scale_is_one_percent(make_loss):
+    assert make_loss("policy").scale_tau == make_loss("whole").scale_tau == 0.01
+
+
+@pytest.mark.parametrize("kind", ["policy", "whole"])
+def test_the_scale_that_a_call_reports_divides_the_divergence_of_that_call(make_loss, slices, plain_errors, kind):
+    loss = make_loss(kind, rho=1.0, entropy_coef=0.0, scale_tau=0.5)
+    kl = plain_errors(loss, slices, _noise(slices))["kl"].mean()
+    out = loss(slices)
+    assert out["kl_scale"] > 1.1
+    torch.testing.assert_close(out["loss_policy"], kl / out["kl_scale"])
+    torch.testing.assert_close(out["policy_kl"], kl.detach())
+
+
+def test_the_scale_divides_as_a_constant(make_world_model, make_loss, slices, gradients):
+    world_model = make_world_model()
+    loss = make_loss("policy", world_model, entropy_coef=0.0, scale_tau=1.0)
+    scaled = loss(slices)
+    found = gradients(scaled["loss_policy"], world_model)["policy"]
+    loss.eval().kl_scale.fill_(1.0)
+    plain = gradients(loss(slices)["loss_policy"], world_model)["policy"]
+    assert scaled["kl_scale"] > 1.1
+    for name in plain:
+        torch.testing.assert_close(found[name] * scaled["kl_scale"], plain[name])
+
+
+def test_the_scale_is_never_below_one(make_world_model, make_loss, slices, constant_policy):
+    world_model = make_world_model()
+    constant_policy(world_model, _MEAN, _STD)
+    _set_plan(slices, _MEAN, _STD)  # no divergence, no spread
+    loss = make_loss("policy", world_model, scale_tau=1.0)
+    loss(slices)
+    assert loss.kl_scale == 1
+
+
+@pytest.mark.parametrize("kind", ["policy", "whole"])
+def test_the_scale_moves_in_training_mode_only(make_loss, slices, kind):
+    loss = make_loss(kind, scale_tau=1.0).eval()
+    loss(slices)
+    assert loss.kl_scale == 1
+    loss.train()(slices)
+    assert loss.kl_scale > 1
+
+
+def test_the_scale_rests_while_distillation_is_off(make_loss, slices):
+    loss = make_loss("whole", scale_tau=1.0, distill=False)
+    loss(slices)
+    assert loss.kl_scale == 1
+
+
+def test_a_reported_scale_does_not_change_with_later_calls(make_loss, make_slices):
+    loss = make_loss("policy", scale_tau=0.5)
+    first = loss(make_slices())["kl_scale"]
+    value = first.item()
+    loss(make_slices())
+    assert first.item() == value
+
+
+def test_step_k_counts_rho_to_the_k_with_k_from_zero(make_loss, make_slices):
+    slices = make_slices(slice_len=4)
+    loss = make_loss("policy", rho=0.3, reduction="none").eval()
+    decayed = loss(slices)["loss_policy"]
+    loss.rho.fill_(1.0)
+    torch.testing.assert_close(decayed / loss(slices)["loss_policy"], torch.tensor([1.0, 0.3, 0.09, 0.027]).expand(4, 4))
+
+
+def test_the_coefficient_weighs_divergence_and_entropy_once(make_world_model, make_loss, slices):
+    world_model = make_world_model()
+    one = make_loss("policy", world_model, entropy_coef=0.1).eval()(slices)
+    seven = make_loss("policy", world_model, entropy_coef=0.1, policy_coef=7.0).eval()(slices)
+    torch.testing.assert_close(seven["loss_policy"], 7 * one["loss_policy"])
+    for metric in ("policy_kl", "policy_entropy", "kl_scale"):
+        assert seven[metric] == one[metric]
