@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.stats import kstest
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, SeedPolicy, WorldModel
 
@@ -50,6 +50,15 @@ def test_it_writes_exactly_what_the_planner_writes(keys):
     assert set(seeded.keys(True, True)) == set(planned.keys(True, True)) == set(policy.out_keys)
     for key in policy.out_keys:
         assert (seeded[key].dtype, seeded[key].shape) == (planned[key].dtype, planned[key].shape), key
+
+
+def test_a_composite_spec_is_read_at_the_action_s_key():
+    spec = Composite(control=Composite(u=BOUNDS, brake=Unbounded((3,))))
+    torch.manual_seed(0)
+    out = SeedPolicy(spec, action_key=("control", "u"))(TensorDict())
+    torch.manual_seed(0)
+    assert torch.equal(out["control", "u"], SeedPolicy(BOUNDS)(TensorDict())["action"])
+    assert ("control", "brake") not in out.keys(True)
 
 
 def test_what_was_there_stays():

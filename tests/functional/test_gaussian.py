@@ -50,7 +50,9 @@ def test_entropy_equals_torchs():
 
 
 def test_entropy_grows_by_one_nat_when_the_std_grows_e_fold():
-    torch.testing.assert_close(gaussian_entropy(STD_P.log() + 1) - gaussian_entropy(STD_P.log()), torch.ones(4).double())
+    torch.testing.assert_close(
+        gaussian_entropy(STD_P.log() + 1) - gaussian_entropy(STD_P.log()), torch.ones(4).double()
+    )
 
 
 def test_a_sample_without_noise_is_the_mean_and_noise_is_scaled_by_the_std():

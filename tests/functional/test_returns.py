@@ -143,9 +143,7 @@ def test_any_leading_batch_gives_the_result_of_its_parts_and_inputs_are_left_alo
     assert all(torch.equal(a, b) for a, b in zip((rewards, values, alive), before, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("rewards", "values"), [((3, 2), (4, 2, 2)), ((3, 2), (3, 4, 2)), ((5, 3, 2), (5, 1, 1, 2))]
-)
+@pytest.mark.parametrize(("rewards", "values"), [((3, 2), (4, 2, 2)), ((3, 2), (3, 4, 2)), ((5, 3, 2), (5, 1, 1, 2))])
 def test_tables_that_do_not_fit_are_refused_with_their_shapes(rewards, values):
     message = (
         f"return_table needs rewards [..., H, F] and values [..., D, F, V] with D <= H, got {rewards} and {values}."

@@ -68,6 +68,5 @@ def test_a_latent_size_that_no_group_size_divides_is_refused_with_the_remedy():
     with pytest.raises(ValueError) as error:
         simnorm(torch.zeros(2, 20), 8)
     assert str(error.value) == (
-        "simnorm needs a latent size divisible by group_size=8, got 20; "
-        "choose latent_dim as a multiple of group_size."
+        "simnorm needs a latent size divisible by group_size=8, got 20; choose latent_dim as a multiple of group_size."
     )

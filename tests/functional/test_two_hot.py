@@ -11,12 +11,12 @@ from torchrl.objectives import two_hot_encode as torchrl_two_hot_encode
 from torchrl_etdmpc.functional import symexp, symlog, two_hot_cross_entropy, two_hot_decode, two_hot_encode
 
 BINS = torch.linspace(-10, 10, 101)
-BINS64 = BINS.double()
+BINS64 = torch.linspace(-10, 10, 101, dtype=torch.float64)
 SCALARS = torch.cat([torch.linspace(-2e4, 2e4, 801), torch.linspace(-3, 3, 601), torch.logspace(-6, 4, 50)])
 
 
 def position_of(x: float) -> float:
-    """The fractional index of a scalar among BINS, from the definition."""
+    """The fractional index of a scalar among the bins, from the definition."""
     return (math.copysign(math.log1p(abs(x)), x) + 10) / 0.2
 
 
@@ -124,7 +124,7 @@ def test_two_hot_equals_torchrls_in_symlog_space(low, high, num_bins):
 def test_two_hot_has_the_scalar_as_its_mean_in_symlog_space(x):
     weights = two_hot_encode(torch.tensor(x, dtype=torch.float64), BINS64)
     mean_index = (weights * torch.arange(101)).sum().item()
-    assert mean_index == pytest.approx(position_of(x), abs=1e-4)  # BINS are float32 multiples of 0.2
+    assert mean_index == pytest.approx(position_of(x), abs=1e-9)
 
 
 def test_a_nan_stays_nan_and_does_not_reach_its_neighbours():

@@ -150,6 +150,19 @@ def gradients() -> Callable[[Tensor, WorldModel], dict[str, dict[str, Tensor | N
 
 
 @pytest.fixture
+def assert_same_gradients() -> Callable[..., None]:
+    """Asserts that two results of ``gradients`` agree, also in where there is none."""
+
+    def check(actual: dict, expected: dict, networks: set[str] | None = None) -> None:
+        for network in expected if networks is None else networks:
+            torch.testing.assert_close(
+                actual[network], expected[network], msg=lambda text, network=network: f"{network}: {text}"
+            )
+
+    return check
+
+
+@pytest.fixture
 def constant_policy() -> Callable[[WorldModel, Tensor, Tensor], None]:
     """Makes the policy the same Gaussian at every latent."""
 

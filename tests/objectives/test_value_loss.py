@@ -28,15 +28,13 @@ def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step
 
 
 def test_the_gradient_is_that_of_the_plain_reference(
-    make_world_model, make_loss, slices, run_seeded, plain_errors, depth_mean, gradients
+    make_world_model, make_loss, slices, run_seeded, plain_errors, depth_mean, gradients, assert_same_gradients
 ):
     world_model = make_world_model()
     loss = make_loss("value", world_model).eval()
     expected = gradients(0.1 * depth_mean(plain_errors(loss, slices, _noise(slices))["value"]), world_model)
     actual = gradients(run_seeded(loss, slices)["loss_value"], world_model)
-    for network in expected:
-        for name, gradient in expected[network].items():
-            torch.testing.assert_close(actual[network][name], gradient, msg=lambda text: f"{network} {name}: {text}")
+    assert_same_gradients(actual, expected)
 
 
 def test_the_target_is_the_expected_reward_and_the_discounted_mean_over_all_heads(make_world_model):

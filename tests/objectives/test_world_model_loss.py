@@ -41,15 +41,22 @@ def test_the_terms_equal_a_plain_reference_written_head_by_head_and_step_by_step
     ("term", "coefficient", "rho"), [("consistency", 20, 0.5), ("reward", 0.1, 0.5), ("termination", 1, 1.0)]
 )
 def test_the_gradient_of_each_term_is_that_of_the_plain_reference(
-    make_world_model, make_loss, slices, plain_errors, depth_mean, gradients, term, coefficient, rho
+    make_world_model,
+    make_loss,
+    slices,
+    plain_errors,
+    depth_mean,
+    gradients,
+    assert_same_gradients,
+    term,
+    coefficient,
+    rho,
 ):
     world_model = make_world_model(termination=True)
     loss = make_loss("model", world_model)
     expected = gradients(coefficient * depth_mean(plain_errors(loss, slices, _noise(slices))[term], rho), world_model)
     actual = gradients(loss(slices)[f"loss_{term}"], world_model)
-    for network, parameters in expected.items():
-        for name, gradient in parameters.items():
-            torch.testing.assert_close(actual[network][name], gradient, msg=lambda text: f"{network} {name}: {text}")
+    assert_same_gradients(actual, expected)
 
 
 @pytest.mark.parametrize("term", ["consistency", "reward", "value", "termination"])

@@ -133,7 +133,7 @@ def test_every_interval_th_sample_alone_is_planned():
 def test_the_first_slices_alone_are_renewed_in_the_batch_and_in_the_buffer(tmp_path, memmap, planner):
     storage = LazyMemmapStorage(40, scratch_dir=tmp_path) if memmap else None
     buffer = make_buffer(40, storage=storage)
-    reanalyze = make_reanalyze(buffer, planner())
+    make_reanalyze(buffer, planner())
     torch.manual_seed(2)
     before = content(buffer)
     batch = buffer.sample()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Bounded, TensorSpec
+from torchrl.data import Bounded, Composite, TensorSpec
 
 
 class SeedPolicy(TensorDictModuleBase):
@@ -14,7 +14,8 @@ class SeedPolicy(TensorDictModuleBase):
     Writing the whole schema from the first row on matters: a storage leaves missing entries uninitialised.
 
     Args:
-        action_spec (TensorSpec): bounds of the action, of the whole batch of environments.
+        action_spec (TensorSpec): bounds of the action, of the whole batch of environments; a ``Composite`` (an
+            environment's ``action_spec`` if its action is nested) is read at ``action_key``.
 
     Keyword Args:
         action_key (NestedKey): Default: ``"action"``.
@@ -33,6 +34,8 @@ class SeedPolicy(TensorDictModuleBase):
         self, action_spec: TensorSpec, *, action_key: NestedKey = "action", plan_key: NestedKey = "plan"
     ) -> None:
         super().__init__()
+        if isinstance(action_spec, Composite):
+            action_spec = action_spec[action_key]
         if not isinstance(action_spec, Bounded):
             raise ValueError(f"SeedPolicy needs a bounded continuous action, got {type(action_spec).__name__}.")
         self.action_spec = action_spec

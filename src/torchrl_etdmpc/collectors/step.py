@@ -53,7 +53,8 @@ class StepCollector(BaseCollector):
 
     Raises:
         ValueError: if an argument is out of range.
-        NonFiniteError: while iterating, if an observation, a reward or an action is not finite; the step is not stored.
+        NonFiniteError: while iterating, if an observation, a reward or an action is not finite; the step is not
+            stored, and collection can go on with fresh episodes.
 
     >>> from torchrl.data import LazyTensorStorage
     >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
@@ -104,17 +105,17 @@ class StepCollector(BaseCollector):
         self.exploration_type = exploration_type
         self.policy_device = None if policy_device is None else torch.device(policy_device)
         self.num_envs = max(self.env.batch_size.numel(), 1)
+        self.requested_frames_per_batch = self.num_envs  # the base class' len() and stats() read it
         self.closed = False
         self._frames = 0
         self._next_trajectory = 0
         self._carrier: TensorDictBase | None = None
         self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
         self._schema: dict[bool, set] = {}
-        observation_keys = [unravel_key(("next", key)) for key in self.env.observation_spec.keys(True, True)]
         excluded = set(self.exclude_keys)
-        self._checked = [key for key in observation_keys if key not in excluded] + [
-            unravel_key(("next", key)) for key in self.env.reward_keys
-        ]
+        observation_keys = self.env.observation_spec.keys(True, True)
+        self._checked_before = [key for key in observation_keys if unravel_key(key) not in excluded]
+        self._checked_after = [unravel_key(("next", key)) for key in (*self._checked_before, *self.env.reward_keys)]
 
     @property
     def frames(self) -> int:
@@ -139,12 +140,13 @@ class StepCollector(BaseCollector):
         """One decision of every environment: act, step, check, store."""
         if self._carrier is None:
             self._carrier = self._start(self.env.reset())
+        self._check_finite(self._carrier, self._checked_before, "the environment")  # a reset's are new here
         seeding = self.in_seed_phase
         with set_exploration_type(self.exploration_type):
             tensordict = self._act(self._carrier, seeding)
         self._check_finite(tensordict, self.env.action_keys, "the policy")
         stepped, carrier = self.env.step_and_maybe_reset(tensordict)
-        self._check_finite(stepped, self._checked, "the environment")
+        self._check_finite(stepped, self._checked_after, "the environment")
         rows = stepped.exclude(*self.exclude_keys).reshape(-1)
         self._check_schema(rows, seeding)
         self._store(rows)
@@ -183,11 +185,16 @@ class StepCollector(BaseCollector):
                 self.replay_buffer.extend(torch.stack(self._pending[position]))
                 self._pending[position] = []
 
+    def _abandon_episodes(self) -> None:
+        self._carrier = None
+        self._pending = [[] for _ in range(self.num_envs)]
+
     def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:
         for key in keys:
             value = tensordict.get(key)
             if value.is_floating_point() and not value.isfinite().all():
                 rows = value.isfinite().reshape(self.num_envs, -1).all(-1).logical_not().nonzero().flatten().tolist()
+                self._abandon_episodes()  # the environment may have moved on
                 raise NonFiniteError(
                     f"{source} returned a non-finite {key!r} at decision step {self._frames} (environments {rows}); "
                     "the step was not stored."
@@ -206,8 +213,7 @@ class StepCollector(BaseCollector):
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the environments; the running episode is abandoned."""
-        self._carrier = None
-        self._pending = [[] for _ in range(self.num_envs)]
+        self._abandon_episodes()
         return self.env.set_seed(seed, static_seed=static_seed)
 
     def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
@@ -227,8 +233,7 @@ class StepCollector(BaseCollector):
         """Restores the counters; collection goes on with a fresh episode and a fresh trajectory id."""
         self._frames = state_dict["frames"]
         self._next_trajectory = state_dict["next_trajectory"]
-        self._carrier = None
-        self._pending = [[] for _ in range(self.num_envs)]
+        self._abandon_episodes()
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(num_envs={self.num_envs}, frames={self._frames}, insertion={self.insertion!r})"

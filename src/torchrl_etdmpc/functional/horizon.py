@@ -76,7 +76,7 @@ def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Te
     excess = (mean.unsqueeze(-2) - mean.unsqueeze(-1)).clamp_min(0)  # [..., h, g] = max(q_g - q_h, 0)
     support = (precision.unsqueeze(-2) * excess.square()).sum(-1) <= beta**2
     weight = precision * support
-    # Sums are relative to the most certain depth of the support: in float32, a large offset would swallow its small gap.
+    # Sums are relative to the support's most certain depth, whose small gap float32 would lose next to a large one.
     anchor = mean.gather(-1, weight.argmax(-1, keepdim=True))
     gap = mean - anchor
     total = weight.sum(-1, keepdim=True)

@@ -141,6 +141,7 @@ def policy_terms(
     )
     if loss.training:
         loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau))
-    term = kl / loss.kl_scale - loss.entropy_coef * slices.action.shape[-1] * entropy
-    metrics = {"policy_kl": kl.mean(), "policy_entropy": entropy.mean(), "kl_scale": loss.kl_scale.clone()}
+    scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
+    term = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
+    metrics = {"policy_kl": kl.mean(), "policy_entropy": entropy.mean(), "kl_scale": scale}
     return {"policy": loss._discount_depth(term.mean(1))}, metrics

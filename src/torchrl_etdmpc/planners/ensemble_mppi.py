@@ -36,7 +36,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     Each candidate action sequence is rolled through every dynamics head; the table of return estimates over depths,
     dynamics heads and value heads (thesis Eq. 3.1) is reduced to a score by ``score``. The planner acts on a real
-    environment (it reads ``observation``) as well as on the :class:`LatentEnv` it holds (it reads ``latent``).
+    environment (it reads ``observation``) as well as on the :class:`LatentEnv` it holds (it reads ``latent``, which
+    takes precedence: an imagined rollout keeps the observation that it began with).
 
     It obeys :func:`torchrl.envs.utils.exploration_type`: with ``RANDOM`` (a collector's default) the action is a sample
     and the target's mean comes from ``first_action``; otherwise the action is the mean from ``eval_first_action``.
@@ -191,15 +192,15 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         """Plans for every state of the batch and writes action, target and warm start.
 
         Args:
-            tensordict (TensorDictBase): ``observation [..., O]`` (or ``latent [..., L]``), and for the warm start
-                ``plan_mean [..., H, A]`` and ``is_init [..., 1]``, each optional.
+            tensordict (TensorDictBase): ``latent [..., L]`` or, without one, ``observation [..., O]``, and for the warm
+                start ``plan_mean [..., H, A]`` and ``is_init [..., 1]``, each optional.
             tensordict_out (TensorDictBase, optional): where to write. Default: ``tensordict``.
 
         Raises:
             KeyError: if neither an observation nor a latent is present.
         """
-        observation = tensordict.get(self.observation_key, None)
-        latent = tensordict.get("latent", None) if observation is None else None
+        latent = tensordict.get("latent", None)
+        observation = tensordict.get(self.observation_key, None) if latent is None else None
         if observation is None and latent is None:
             raise KeyError(
                 f"the planner needs {self.observation_key!r} (or 'latent') in its input; pass observation_key=... if "

@@ -327,7 +327,7 @@ PRESETS: dict[str, TrainConfig] = {
         _preset(
             "cpu",
             total_env_steps=50_000,
-            eval_every=5_000,
+            eval_every=10_000,
             threads=1,
             model=ModelConfig(latent_dim=64, mlp_dim=96, encoder_dim=128, num_dynamics=2, activation="silu"),
             planner=PlannerConfig(horizon=3, num_samples=48, num_elites=10, num_proposals=4, iterations=3),

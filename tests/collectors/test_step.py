@@ -1,0 +1,693 @@
+from __future__ import annotations
+
+from collections import defaultdict
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Composite,
+    LazyTensorStorage,
+    TensorDictReplayBuffer,
+    TensorDictRoundRobinWriter,
+    Unbounded,
+)
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    ExplorationType,
+    GymEnv,
+    InitTracker,
+    ParallelEnv,
+    SerialEnv,
+    TensorDictPrimer,
+    TransformedEnv,
+)
+from torchrl.envs.utils import exploration_type
+from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
+
+from torchrl_etdmpc import (
+    EnsembleMPPIPlanner,
+    LatentEnv,
+    NonFiniteError,
+    SeedPolicy,
+    StepCollector,
+    StepSliceSampler,
+    WorldModel,
+)
+
+TRAJ_KEY = ("collector", "traj_ids")
+
+
+class LineEnv(EnvBase):
+    """A point on a line. The observation is (position, steps of the episode), the reward the position reached.
+
+    An episode is truncated after ``length`` steps and terminated beyond ``border``. ``broken`` turns NaN at the
+    environment's ``broken_at``-th step, ``"reset"`` at its ``broken_at``-th reset.
+    """
+
+    def __init__(self, length=4, *, border=float("inf"), broken="", broken_at=0):
+        super().__init__()
+        self.length, self.border, self.broken, self.broken_at = length, border, broken, broken_at
+        self.observation_spec = Composite(observation=Unbounded((2,)))
+        self.action_spec = Bounded(-1.0, 1.0, shape=(1,))
+        self.reward_spec = Unbounded((1,))
+        self.full_done_spec = Composite(
+            {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        )
+        self.generator = torch.Generator().manual_seed(0)
+        self.steps = self.resets = 0
+
+    def _set_seed(self, seed):
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def _reset(self, tensordict=None):
+        self.resets += 1
+        self.position = torch.rand(1, generator=self.generator)
+        self.count = 0
+        observation = self._observation()
+        if self.broken == "reset" and self.resets == self.broken_at:
+            observation[0] = torch.nan
+        flag = torch.zeros(1, dtype=torch.bool)
+        return TensorDict(
+            {"observation": observation, "done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
+        )
+
+    def _observation(self):
+        return torch.cat([self.position, torch.tensor([float(self.count)])])
+
+    def _step(self, tensordict):
+        self.steps += 1
+        self.count += 1
+        self.position = self.position + tensordict["action"]
+        reward, observation = self.position.clone(), self._observation()
+        if self.steps == self.broken_at and self.broken in ("reward", "observation"):
+            {"reward": reward, "observation": observation}[self.broken][0] = torch.nan
+        terminated = self.position > self.border
+        truncated = torch.tensor([self.count >= self.length])
+        return TensorDict(
+            {
+                "observation": observation,
+                "reward": reward,
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            }
+        )
+
+
+class RandomActions(TensorDictModuleBase):
+    """Uniform actions; calls ``look`` with its input first."""
+
+    in_keys, out_keys = ["observation"], ["action"]
+
+    def __init__(self, look=lambda tensordict: None, answer=None):
+        super().__init__()
+        self.look, self.answer, self.calls = look, answer, 0
+
+    def forward(self, tensordict):
+        self.calls += 1
+        self.look(tensordict)
+        action = torch.rand(*tensordict.batch_size, 1) * 2 - 1
+        return tensordict.set("action", action if self.answer is None else self.answer(self.calls, action))
+
+
+def make_replay(capacity=500, **options) -> TensorDictReplayBuffer:
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity), writer=TensorDictRoundRobinWriter(track_generations=True), **options
+    )
+
+
+def make_env(lengths=(4,), **options) -> EnvBase:
+    """One environment of batch size [], or several of batch size [num_envs]."""
+    makers = [partial(LineEnv, length, **options) for length in lengths]
+    return makers[0]() if len(makers) == 1 else SerialEnv(len(makers), makers)
+
+
+def make_planner(observation_dim=2, **options) -> EnsembleMPPIPlanner:
+    torch.manual_seed(0)
+    model = WorldModel(observation_dim, 1, latent_dim=16, mlp_dim=16, num_dynamics=2)
+    options = {"horizon": 3, "num_samples": 8, "num_elites": 3, "num_proposals": 2, "iterations": 1} | options
+    return EnsembleMPPIPlanner(LatentEnv(model), **options)
+
+
+def episodes(rows: TensorDict) -> dict[int, list[TensorDict]]:
+    """The rows of each trajectory, in the order in which they were stored."""
+    out = defaultdict(list)
+    for row in rows.unbind(0):
+        out[int(row[TRAJ_KEY])].append(row)
+    return out
+
+
+def test_it_is_a_torchrl_collector():
+    collector = StepCollector(make_env(), RandomActions(), replay_buffer=make_replay())
+    assert isinstance(collector, BaseCollector)
+    assert collector.stats()["frames"] == 0
+    collector.update_policy_weights_()
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_a_transition_is_in_the_buffer_before_the_next_action_is_chosen(lengths):
+    replay, seen = make_replay(), []
+    policy = RandomActions(look=lambda tensordict: seen.append(len(replay)))
+    for _ in StepCollector(make_env(lengths), policy, replay_buffer=replay, total_frames=24):
+        pass
+    assert seen == list(range(0, 24, len(lengths)))
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_the_last_transition_can_be_sampled_before_the_next_action_is_chosen(lengths):
+    replay = make_replay(sampler=StepSliceSampler(1))
+    newest = []
+
+    def look(tensordict):
+        if len(replay):
+            newest.append(int(replay.sample(200)["index"].max()))
+
+    for _ in StepCollector(make_env(lengths), RandomActions(look), replay_buffer=replay, total_frames=20):
+        pass
+    assert newest == list(range(len(lengths) - 1, 20 - len(lengths), len(lengths)))
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_iterating_yields_what_was_stored_one_step_of_every_environment_at_a_time(lengths):
+    replay = make_replay()
+    collector = StepCollector(make_env(lengths), RandomActions(), replay_buffer=replay, total_frames=22)
+    steps = list(collector)
+    assert len(steps) == len(collector) == 22 // len(lengths)
+    assert all(step.batch_size == (len(lengths),) for step in steps)
+    assert collector.frames == len(replay) == 22
+    yielded, stored = torch.cat(steps), replay.storage[:]
+    assert set(yielded.keys(True, True)) == set(stored.keys(True, True)) - {"index"}
+    for key in yielded.keys(True, True):
+        assert torch.equal(yielded[key], stored[key]), key
+
+
+def test_total_frames_is_reached_by_whole_steps_of_all_environments():
+    collector = StepCollector(make_env((3, 5)), RandomActions(), replay_buffer=make_replay(), total_frames=5)
+    assert len(list(collector)) == len(collector) == 3
+    assert collector.frames == 6
+
+
+def test_without_total_frames_it_goes_on_for_as_long_as_it_is_asked():
+    collector = StepCollector(make_env(), RandomActions(), replay_buffer=make_replay())
+    for _, step in zip(range(30), collector, strict=False):
+        assert step.batch_size == (1,)
+    assert collector.next().batch_size == (1,)
+
+
+def test_the_environment_may_be_given_as_a_function():
+    replay = make_replay()
+    for _ in StepCollector(lambda: LineEnv(2), RandomActions(), replay_buffer=replay, total_frames=4):
+        pass
+    assert len(replay) == 4
+
+
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+def test_trajectory_ids_are_unique_per_episode_and_environment(insertion):
+    replay = make_replay()
+    collector = StepCollector(
+        make_env((3, 5, 4)), RandomActions(), replay_buffer=replay, total_frames=60, insertion=insertion
+    )
+    for _ in collector:
+        pass
+    lengths = []
+    for rows in episodes(replay.storage[:]).values():
+        assert [int(row["observation"][1]) for row in rows] == list(range(len(rows)))
+        for before, after in zip(rows, rows[1:], strict=False):
+            assert torch.equal(before["next", "observation"], after["observation"])
+            assert not before["next", "done"]
+        lengths.append(len(rows))
+    # 20 steps: six episodes of 3, four of 5, five of 4; with "step" also the begun one of 2
+    assert sorted(lengths) == sorted([3] * 6 + [5] * 4 + [4] * 5 + ([2] if insertion == "step" else []))
+
+
+def test_rows_of_several_environments_take_turns_in_their_order():
+    replay = make_replay()
+    for _ in StepCollector(make_env((3, 5)), RandomActions(), replay_buffer=replay, total_frames=16):
+        pass
+    assert replay.storage[:]["observation"][:, 1].tolist() == [0, 0, 1, 1, 2, 2, 0, 3, 1, 4, 2, 0, 0, 1, 1, 2]
+
+
+def test_with_episode_insertion_an_episode_is_stored_when_it_ends_and_as_a_whole():
+    replay = make_replay()
+    collector = StepCollector(make_env((3, 5)), RandomActions(), replay_buffer=replay, insertion="episode")
+    sizes = []
+    for _ in range(10):
+        collector.step()
+        sizes.append(len(replay))
+    assert sizes == [0, 0, 3, 3, 8, 11, 11, 11, 14, 19]
+    stored = replay.storage[:]
+    assert stored["observation"][:, 1].tolist() == [*range(3), *range(5), *range(3), *range(3), *range(5)]
+    assert stored["next", "done"].flatten().nonzero().flatten().tolist() == [2, 7, 10, 13, 18]
+    assert stored[TRAJ_KEY].tolist() == [0] * 3 + [1] * 5 + [2] * 3 + [4] * 3 + [3] * 5
+
+
+def test_both_insertions_store_the_same_transitions():
+    stored = {}
+    for insertion in ("step", "episode"):
+        replay = make_replay()
+        env = make_env((3, 5))
+        torch.manual_seed(0)
+        collector = StepCollector(env, RandomActions(), replay_buffer=replay, insertion=insertion, total_frames=30)
+        collector.set_seed(0)
+        for _ in collector:
+            pass
+        stored[insertion] = episodes(replay.storage[:])
+    assert stored["step"].keys() == stored["episode"].keys()  # 15 steps: both environments end an episode there
+    for trajectory, rows in stored["step"].items():
+        for one, other in zip(rows, stored["episode"][trajectory], strict=True):
+            assert (one.exclude("index") == other.exclude("index")).all()
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_what_is_stored_equals_an_independent_replay_of_the_actions(lengths):
+    replay = make_replay()
+    collector = StepCollector(make_env(lengths), RandomActions(), replay_buffer=replay, total_frames=40)
+    collector.set_seed(3)
+    for _ in collector:
+        pass
+    reference = make_env(lengths)
+    reference.set_seed(3)
+    single = reference.batch_size == ()
+    observation = reference.reset()["observation"].reshape(-1, 2)
+    for rows in replay.storage[:].split(len(lengths)):
+        assert torch.equal(rows["observation"], observation)
+        action = rows["action"].squeeze(0) if single else rows["action"]
+        out = reference.step(TensorDict({"action": action}, reference.batch_size))["next"].reshape(-1)
+        for key in ("observation", "reward", "done", "terminated", "truncated"):
+            assert torch.equal(rows["next", key], out[key]), key
+        observation = out["observation"].clone()
+        if out["done"].any():
+            fresh = reference.reset(
+                TensorDict({"_reset": out["done"].reshape(reference.done_spec.shape)}, reference.batch_size)
+            )
+            observation = torch.where(out["done"], fresh["observation"].reshape(-1, 2), observation)
+
+
+def test_a_gymnasium_task_is_stored_as_gymnasium_itself_plays_it():
+    gymnasium = pytest.importorskip("gymnasium")
+    env, replay = GymEnv("Pendulum-v1"), make_replay()
+    collector = StepCollector(env, SeedPolicy(env.action_spec), replay_buffer=replay, total_frames=230)
+    collector.set_seed(5)
+    for _ in collector:
+        pass
+    collector.shutdown()
+    stored = replay.storage[:]
+
+    reference = gymnasium.make("Pendulum-v1")
+    reference.reset(seed=5)
+    observation, _ = reference.reset()
+    for row in stored.unbind(0):
+        torch.testing.assert_close(row["observation"], torch.as_tensor(observation))
+        observation, reward, terminated, truncated, _ = reference.step(row["action"].numpy())
+        torch.testing.assert_close(row["next", "observation"], torch.as_tensor(observation))
+        assert float(row["next", "reward"]) == pytest.approx(float(reward), rel=1e-5, abs=1e-6)
+        assert (bool(row["next", "terminated"]), bool(row["next", "truncated"])) == (terminated, truncated)
+        if terminated or truncated:
+            observation, _ = reference.reset()
+    reference.close()
+    assert stored[TRAJ_KEY].tolist() == [0] * 200 + [1] * 30
+
+
+def test_termination_and_truncation_are_stored_apart():
+    replay = make_replay()
+    policy = RandomActions(answer=lambda call, action: torch.ones_like(action))
+    for _ in StepCollector(make_env((4, 50), border=2.5), policy, replay_buffer=replay, total_frames=60):
+        pass
+    for _ in StepCollector(make_env((1, 1), border=2.5), policy, replay_buffer=replay, total_frames=20):
+        pass
+    rows = replay.storage[:]
+    expected = rows["next", "observation"][:, :1] > 2.5
+    assert torch.equal(rows["next", "terminated"], expected)
+    assert expected[:60].any() and not expected[60:].any()
+    assert rows["next", "truncated"][60:].any()
+    assert torch.equal(rows["next", "done"], rows["next", "terminated"] | rows["next", "truncated"])
+
+
+def test_processes_of_a_parallel_environment_are_stored_like_environments_in_turn():
+    replay, seen = make_replay(sampler=StepSliceSampler(2)), []
+    env = ParallelEnv(2, [partial(CountingEnv, max_steps=steps) for steps in (3, 5)])
+    policy = CountingEnvCountPolicy(env.action_spec)
+
+    class Watching(TensorDictModuleBase):
+        in_keys, out_keys = ["observation"], ["action"]
+
+        def forward(self, tensordict):
+            seen.append(len(replay))
+            return policy(tensordict)
+
+    collector = StepCollector(env, Watching(), replay_buffer=replay, total_frames=40)
+    steps = list(collector)
+    assert seen == list(range(0, 40, 2))
+    stored = replay.storage[:]
+    assert (torch.cat(steps)["next", "observation"] == stored["next", "observation"]).all()
+    for rows in episodes(stored).values():
+        counts = [int(row["observation"]) for row in rows]
+        assert counts == list(range(len(rows)))
+        assert [int(row["next", "observation"]) for row in rows] == [count + 1 for count in counts]
+        assert [bool(row["next", "done"]) for row in rows[:-1]] == [False] * (len(rows) - 1)
+    pairs = replay.sample(400).reshape(-1, 2)
+    assert (pairs["observation"].diff(dim=1) == 1).all()
+    collector.shutdown()
+    collector.shutdown()
+    assert env.is_closed
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_the_seed_phase_ends_exactly_after_its_frames_and_writes_the_planner_s_schema(lengths):
+    replay, planner, env = make_replay(), make_planner(), make_env(lengths)
+    planner.world_model.version.fill_(9)
+    collector = StepCollector(
+        env,
+        planner,
+        replay_buffer=replay,
+        total_frames=26,
+        init_random_frames=18,
+        seed_policy=SeedPolicy(env.action_spec),
+    )
+    steps, phases = [], []
+    while collector.frames < 26:
+        phases.append(collector.in_seed_phase)
+        steps.append(collector.step())
+    assert phases == [True] * (18 // len(lengths)) + [False] * (8 // len(lengths))
+    seed, planned = torch.cat(steps)[:18], torch.cat(steps)[18:]
+    assert (seed["plan", "loc"] == 0).all() and (seed["plan", "scale"] == 1).all()
+    assert (seed["plan", "value"] == 0).all() and (seed["plan", "version"] == 0).all()
+    assert len(seed["action"].unique()) == 18 and seed["action"].abs().max() <= 1
+    assert (planned["plan", "version"] == 9).all() and (planned["plan", "scale"] != 1).all()
+    assert set(seed.keys(True, True)) == set(planned.keys(True, True))
+    stored = replay.storage[:]
+    for key in planned.keys(True, True):
+        assert seed[key].dtype == planned[key].dtype == stored[key].dtype, key
+        assert seed[key].shape[1:] == planned[key].shape[1:] == stored[key].shape[1:], key
+        assert torch.equal(stored[key], torch.cat([seed[key], planned[key]])), key
+    assert set(stored.keys(True, True)) == set(planned.keys(True, True)) | {"index"}  # nothing was left unwritten
+
+
+def test_the_seed_phase_ends_with_the_first_step_that_begins_after_it():
+    env = make_env((3, 5))
+    collector = StepCollector(
+        env,
+        RandomActions(),
+        replay_buffer=make_replay(),
+        init_random_frames=5,
+        seed_policy=RandomActions(),
+        total_frames=12,
+    )
+    for _ in collector:
+        pass
+    assert (collector.seed_policy.calls, collector.policy.calls) == (3, 3)
+
+
+def test_a_seed_policy_with_another_schema_is_refused_before_its_row_is_stored():
+    env, replay = make_env(), make_replay()
+    collector = StepCollector(
+        env, make_planner(), replay_buffer=replay, init_random_frames=2, seed_policy=RandomActions()
+    )
+    collector.step(), collector.step()
+    with pytest.raises(ValueError, match=r"must write the same keys; they differ in .*'plan', 'loc'"):
+        collector.step()
+    assert len(replay) == 2
+
+
+def test_a_seed_phase_without_a_seed_policy_is_refused():
+    with pytest.raises(ValueError, match=r"init_random_frames=10 needs a seed_policy .*SeedPolicy\(env.action_spec\)"):
+        StepCollector(make_env(), RandomActions(), replay_buffer=make_replay(), init_random_frames=10)
+
+
+def test_an_unknown_insertion_is_refused():
+    with pytest.raises(ValueError, match="insertion must be 'step' or 'episode', got 'batch'"):
+        StepCollector(make_env(), RandomActions(), replay_buffer=make_replay(), insertion="batch")
+
+
+def test_more_than_one_batch_dimension_is_refused():
+    env = SerialEnv(2, lambda: SerialEnv(2, LineEnv))
+    with pytest.raises(ValueError, match=r"at most one batch dimension, got torch.Size\(\[2, 2\]\)"):
+        StepCollector(env, RandomActions(), replay_buffer=make_replay())
+
+
+@pytest.mark.parametrize("chosen", [None, ExplorationType.DETERMINISTIC])
+def test_both_policies_see_the_exploration_type(chosen):
+    types = []
+    policies = [RandomActions(look=lambda tensordict: types.append(exploration_type())) for _ in range(2)]
+    collector = StepCollector(
+        make_env(),
+        policies[0],
+        seed_policy=policies[1],
+        init_random_frames=1,
+        replay_buffer=make_replay(),
+        total_frames=2,
+        **({} if chosen is None else {"exploration_type": chosen}),
+    )
+    before = exploration_type()
+    for _ in collector:
+        assert exploration_type() is before
+    assert types == [chosen or ExplorationType.RANDOM] * 2
+
+
+def test_the_exploration_type_reaches_the_planner():
+    stored = {}
+    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        replay = make_replay()
+        for _ in StepCollector(make_env(), make_planner(), replay_buffer=replay, total_frames=8, exploration_type=kind):
+            pass
+        stored[kind] = replay.storage[:]
+    assert (
+        stored[ExplorationType.DETERMINISTIC]["action"] == stored[ExplorationType.DETERMINISTIC]["plan", "loc"]
+    ).all()
+    assert (stored[ExplorationType.RANDOM]["action"] != stored[ExplorationType.RANDOM]["plan", "loc"]).any()
+
+
+def _primers(env: EnvBase) -> int:
+    transform = getattr(env, "transform", None)
+    return sum(
+        isinstance(one, TensorDictPrimer) for one in (transform if isinstance(transform, Compose) else [transform])
+    )
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_the_planner_is_warm_started_within_episodes_and_the_plan_is_not_stored(lengths):
+    replay, planner = make_replay(), make_planner()
+    received, made, plan = [], [], planner.plan
+
+    def spy(observation, plan_mean=None, **options):
+        received.append(plan_mean.clone())
+        made.append(plan(observation, plan_mean, **options))
+        return made[-1]
+
+    planner.plan = spy
+    steps = list(StepCollector(make_env(lengths), planner, replay_buffer=replay, total_frames=24))
+    assert not [key for key in replay.storage[:].keys(True, True) if "plan_mean" in key]
+    assert not [key for key in steps[0].keys(True, True) if "plan_mean" in key]
+    cold = 0
+    for now, before, step in zip(received[1:], made, steps, strict=False):
+        begins = step["next", "done"].reshape(-1, 1, 1)
+        before = before.mean.reshape(-1, 3, 1)
+        assert torch.equal(now.reshape(-1, 3, 1), torch.where(begins, torch.zeros_like(before), before))
+        assert (before != 0).any()
+        cold += int(begins.sum())
+    assert cold == sum((24 // len(lengths) - 1) // length for length in lengths)
+    assert (received[0] == 0).all()
+
+
+def test_the_primer_is_added_once_and_only_if_it_is_needed():
+    planner = make_planner()
+    first = StepCollector(make_env(), planner, replay_buffer=make_replay())
+    assert _primers(first.env) == 1
+    assert _primers(StepCollector(first.env, planner, replay_buffer=make_replay()).env) == 1
+    own = TransformedEnv(make_env(), InitTracker()).append_transform(planner.make_tensordict_primer())
+    assert _primers(StepCollector(own, planner, replay_buffer=make_replay()).env) == 1
+    cold = StepCollector(make_env(), make_planner(warm_start=False), replay_buffer=make_replay())
+    assert _primers(cold.env) == 0
+    assert _primers(StepCollector(make_env(), RandomActions(), replay_buffer=make_replay()).env) == 0
+
+
+def test_further_keys_can_be_kept_out_of_the_buffer():
+    replay = make_replay()
+    env = TransformedEnv(make_env(), InitTracker())
+    list(
+        StepCollector(
+            env,
+            RandomActions(),
+            replay_buffer=replay,
+            total_frames=8,
+            exclude_keys=["is_init", ("next", "is_init"), ("next", "truncated")],
+        )
+    )
+    keys = set(replay.storage[:].keys(True, True))
+    assert not keys & {"is_init", ("next", "is_init"), ("next", "truncated")}
+    assert {"observation", ("next", "observation"), ("next", "terminated"), "truncated"} <= keys
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_a_policy_device_changes_nothing_but_where_the_policy_runs(lengths):
+    stored = []
+    for device in (None, "cpu"):
+        replay, planner = make_replay(), make_planner()
+        collector = StepCollector(
+            make_env(lengths), planner, replay_buffer=replay, total_frames=20, policy_device=device
+        )
+        collector.set_seed(0)
+        list(collector)
+        stored.append(replay.storage[:])
+    assert set(stored[0].keys(True, True)) == set(stored[1].keys(True, True))
+    assert (stored[0] == stored[1]).all()
+
+
+def test_collection_is_reproducible_by_set_seed_and_torch_manual_seed():
+    stored = []
+    for seed in (1, 1, 2):
+        replay = make_replay()
+        collector = StepCollector(make_env((3, 5)), RandomActions(), replay_buffer=replay, total_frames=20)
+        collector.step()  # on an episode that the seed abandons
+        replay.empty()
+        torch.manual_seed(0)
+        assert isinstance(collector.set_seed(seed), int)
+        list(collector)
+        stored.append(replay.storage[:])
+    assert torch.equal(stored[0]["next", "observation"], stored[1]["next", "observation"])
+    assert not torch.equal(stored[0]["observation"][0], stored[2]["observation"][0])
+
+
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+def test_an_episode_that_a_seed_abandons_never_continues(insertion):
+    replay = make_replay()
+    collector = StepCollector(make_env((5,)), RandomActions(), replay_buffer=replay, insertion=insertion)
+    for _ in range(3):
+        collector.step()
+    collector.set_seed(0)
+    for _ in range(10):
+        collector.step()
+    lengths = [len(rows) for rows in episodes(replay.storage[:]).values()]
+    assert lengths == ([3, 5, 5] if insertion == "step" else [5, 5])
+
+
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
+    replay = make_replay()
+    options = {"replay_buffer": replay, "insertion": insertion, "init_random_frames": 16, "total_frames": 48}
+    first = StepCollector(make_env((3, 5)), RandomActions(), seed_policy=RandomActions(), **options)
+    for _ in range(7):
+        first.step()
+    used = set(replay.storage[:][TRAJ_KEY].tolist()) | {first.state_dict()["next_trajectory"] - 1}
+    rows = len(replay)
+    resumed = StepCollector(make_env((3, 5)), RandomActions(), seed_policy=RandomActions(), **options)
+    resumed.step()  # forgotten by loading
+    replay_rows = len(replay)
+    resumed.load_state_dict(first.state_dict())
+    assert (resumed.frames, resumed.in_seed_phase) == (14, True)
+    assert dict(resumed.state_dict()) == dict(first.state_dict())
+    resumed.seed_policy.calls = 0
+    list(resumed)
+    assert resumed.frames == 48
+    assert (resumed.seed_policy.calls, resumed.policy.calls) == (1, 16)
+    fresh = replay.storage[:][replay_rows:]
+    assert rows <= replay_rows
+    assert min(fresh[TRAJ_KEY].tolist()) > max(used)
+    for row in (steps[0] for steps in episodes(fresh).values()):
+        assert row["observation"][1] == 0
+
+
+def test_shutdown_closes_the_environment_and_may_be_repeated():
+    env = make_env((3, 5))
+    collector = StepCollector(env, RandomActions(), replay_buffer=make_replay())
+    collector.step()
+    collector.shutdown()
+    assert env.is_closed
+    collector.shutdown()
+    collector.shutdown(raise_on_error=True)
+
+
+def test_shutdown_of_an_environment_that_was_closed_elsewhere_is_harmless():
+    env = make_env((3, 5))
+    collector = StepCollector(env, RandomActions(), replay_buffer=make_replay())
+    collector.step()
+    env.close()
+    collector.shutdown()
+
+
+def test_shutdown_can_leave_the_environment_open():
+    env = make_env((3, 5))
+    collector = StepCollector(env, RandomActions(), replay_buffer=make_replay())
+    collector.step()
+    collector.shutdown(close_env=False)
+    assert not env.is_closed
+    env.close()
+
+
+def _nan_at(call_number):
+    return lambda call, action: torch.full_like(action, torch.nan) if call == call_number else action
+
+
+@pytest.mark.parametrize(
+    ("broken", "source", "key"),
+    [
+        ("observation", "the environment", r"\('next', 'observation'\)"),
+        ("reward", "the environment", r"\('next', 'reward'\)"),
+        ("action", "the policy", "'action'"),
+    ],
+)
+def test_a_non_finite_value_is_named_with_its_step_and_not_stored(broken, source, key):
+    replay = make_replay()
+    policy = RandomActions(answer=_nan_at(6) if broken == "action" else None)
+    collector = StepCollector(LineEnv(4, broken=broken, broken_at=6), policy, replay_buffer=replay)
+    for _ in range(5):
+        collector.step()
+    with pytest.raises(NonFiniteError, match=f"{source} returned a non-finite {key} at decision step 5 .*not stored"):
+        collector.step()
+    assert len(replay) == collector.frames == 5
+    assert all(value.isfinite().all() for value in replay.storage[:].values(True, True) if value.is_floating_point())
+
+
+@pytest.mark.parametrize("resets", [1, 2], ids=["first-reset", "later-reset"])
+def test_a_non_finite_observation_of_a_reset_is_named_and_not_stored(resets):
+    replay = make_replay()
+    collector = StepCollector(LineEnv(4, broken="reset", broken_at=resets), RandomActions(), replay_buffer=replay)
+    for _ in range(4 * (resets - 1)):
+        collector.step()
+    with pytest.raises(NonFiniteError, match="the environment returned a non-finite 'observation' at decision step"):
+        collector.step()
+    assert len(replay) == 4 * (resets - 1)
+    assert collector.policy.calls == 4 * (resets - 1)
+
+
+def test_a_non_finite_value_is_traced_to_its_environment():
+    env = SerialEnv(3, [LineEnv, partial(LineEnv, broken="reward", broken_at=2), LineEnv])
+    replay = make_replay()
+    collector = StepCollector(env, RandomActions(), replay_buffer=replay)
+    collector.step()
+    with pytest.raises(NonFiniteError, match=r"at decision step 3 \(environments \[1\]\)"):
+        collector.step()
+    assert len(replay) == 3
+
+
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+@pytest.mark.parametrize("broken", ["observation", "reward", "action"])
+def test_collection_that_goes_on_after_a_non_finite_step_starts_a_fresh_episode(broken, insertion):
+    replay = make_replay()
+    policy = RandomActions(answer=_nan_at(6) if broken == "action" else None)
+    env = LineEnv(4, broken=broken, broken_at=6)
+    collector = StepCollector(env, policy, replay_buffer=replay, insertion=insertion)
+    for _ in range(5):
+        collector.step()
+    with pytest.raises(NonFiniteError):
+        collector.step()
+    for _ in range(8):
+        collector.step()
+    rows = episodes(replay.storage[:])
+    assert [len(steps) for steps in rows.values()] == ([4, 1, 4, 4] if insertion == "step" else [4, 4, 4])
+    for steps in rows.values():
+        assert [int(row["observation"][1]) for row in steps] == list(range(len(steps)))
+
+
+def test_no_gradient_is_recorded():
+    weight = torch.nn.Parameter(torch.ones(1))
+    policy = RandomActions(answer=lambda call, action: action * weight)
+    (row,) = StepCollector(make_env(), policy, replay_buffer=make_replay(), total_frames=1)
+    assert not row["action"].requires_grad
