@@ -15,7 +15,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")  # MuJoCo looks for a renderer whe
 import torch  # noqa: E402
 
 from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
-from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, hydra_main  # noqa: E402
+from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, hydra_main, resolve_device  # noqa: E402
 
 
 @hydra_main(config_path=str(Path(__file__).resolve().parent / "config"), config_name="train")
@@ -23,6 +23,7 @@ def main(config: TrainConfig) -> None:
     """One run, from an empty directory to `summary.json`."""
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    resolve_device(config.device)  # an error now leaves no run directory behind
     torch.set_float32_matmul_precision("high")
     torch.manual_seed(config.seed)
     env = make_dmc_env(config.task, seed=config.seed, num_envs=config.num_envs)

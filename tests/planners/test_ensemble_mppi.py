@@ -987,7 +987,7 @@ def test_one_compiled_graph_plans_as_eager_code_does():
 
 @pytest.mark.slow
 def test_a_plan_compiled_to_kernels_is_that_of_eager_code():
-    planner, observation = make_planner(iterations=2), states(3)
+    planner, observation = make_planner(horizon=2, iterations=1), states(3)
     noise = planner.draw_noise(3)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the compiler, about the machine

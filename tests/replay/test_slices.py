@@ -6,7 +6,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 from tensordict import TensorDict
@@ -101,7 +101,7 @@ def contiguous(lengths: list[int], rows: int) -> list[tuple[int, int]]:
     return interleaved(lengths, 1, rows)
 
 
-@settings(max_examples=120, deadline=None, database=None, derandomize=True)
+@settings(max_examples=120, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
 @given(
     lengths=st.lists(st.integers(1, 12), min_size=1, max_size=8),
     num_envs=st.integers(1, 4),

@@ -103,7 +103,8 @@ class StepCollector(BaseCollector):
         self.insertion = insertion
         self.exclude_keys = [unravel_key(key) for key in exclude_keys]
         self.exploration_type = exploration_type
-        self.policy_device = None if policy_device is None else torch.device(policy_device)
+        policy_device = None if policy_device is None else torch.device(policy_device)
+        self.policy_device = None if policy_device == self.env.device else policy_device
         self.num_envs = max(self.env.batch_size.numel(), 1)
         self.requested_frames_per_batch = self.num_envs  # the base class' len() and stats() read it
         self.closed = False

@@ -150,18 +150,21 @@ class ReanalyzeTransform(Transform):
         # Fixed shapes: duplicates are planned too, but every copy of a row takes the first copy's target.
         copies = index.unsqueeze(0) == index.unsqueeze(1)
         original = copies.to(torch.uint8).argmax(1)
-        states = TensorDict({self.observation_key: tensordict.get(self.observation_key)[:rows]}, [rows])
+        observation = tensordict.get(self.observation_key)[:rows]
+        weight = next(self.planner.parameters(), observation)  # the buffer and the networks may live on two devices
+        states = TensorDict({self.observation_key: observation.to(weight.device)}, [rows])
         with set_exploration_type(ExplorationType.RANDOM):
             planned = self.planner(states)
+        planned = planned.select(*self.plan_keys.values()).to(observation.device)
         age = planned.get(self.plan_keys["version"]) - tensordict.get(self.plan_keys["version"])[:rows]
         self.target_age = age.float().mean()
-        patch = {key: planned.get(key)[original.to(planned.get(key).device)] for key in self.plan_keys.values()}
+        patch = {key: planned.get(key)[original] for key in self.plan_keys.values()}
         result = buffer.update_if_present(index=index, generation=generation, patch=patch)
         self.refreshed += result.updated_count
         self.stale += result.stale_count
         for key, value in patch.items():
             stored = tensordict.get(key).clone()
-            stored[:rows] = value.to(stored.device)
+            stored[:rows] = value
             tensordict.set(key, stored)
         # Rows beyond the first slices may be copies of re-planned ones; they keep their old target in this batch.
         return tensordict

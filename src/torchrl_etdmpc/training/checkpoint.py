@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import pickle
-import zipfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from torchrl_etdmpc.training.builders import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
 FORMAT = 1
+_ENTRIES = {"config", "observation_dim", "action_dim", "world_model", "loss", "optimisers", "counters"}
 
 
 class CheckpointError(RuntimeError):
@@ -47,8 +47,11 @@ def save_checkpoint(path: str | Path, agent: Agent, config: TrainConfig, counter
         "counters": dict(counters),
     }
     temporary = path.with_name(path.name + ".tmp")
-    torch.save(content, temporary)
-    os.replace(temporary, path)
+    try:
+        torch.save(content, temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
     return path
 
 
@@ -62,14 +65,21 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{path} is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt.")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, EOFError, ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{path} is not a readable checkpoint ({reason[:120]}).") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what the bytes of a damaged file happen to look like
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # damaged files raise errors of a dozen types, whose texts advise to run the file's code
+        raise CheckpointError(
+            f"{path} is not a readable checkpoint ({type(error).__name__}): it is cut off, damaged or another kind of "
+            "file; use another checkpoint."
+        ) from error
     if not isinstance(content, dict) or "format" not in content or "world_model" not in content:
         raise CheckpointError(f"{path} is a PyTorch file but not a checkpoint of torchrl_etdmpc.")
     if content["format"] != FORMAT:
         raise CheckpointError(f"{path} has checkpoint format {content['format']}; this version reads format {FORMAT}.")
+    missing = sorted(_ENTRIES - content.keys())
+    if missing:
+        raise CheckpointError(f"{path} is not a whole checkpoint: it lacks {', '.join(missing)}.")
     return content
 
 

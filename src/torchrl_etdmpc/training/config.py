@@ -21,6 +21,11 @@ def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     _require(value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}.")
 
 
+def _require_positive(group: str, config: Any, *names: str) -> None:
+    for name in names:
+        _require(getattr(config, name) >= 1, f"{group}{name} must be at least 1, got {getattr(config, name)}.")
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Sizes of the networks (thesis Table A.1); see :class:`~torchrl_etdmpc.modules.WorldModel`."""
@@ -42,11 +47,16 @@ class ModelConfig:
     termination: bool = False
 
     def __post_init__(self) -> None:
+        sizes = ("latent_dim", "mlp_dim", "encoder_dim", "encoder_layers", "num_dynamics", "num_values", "simnorm_dim")
+        _require_positive("model.", self, *sizes)
         _require(
-            self.simnorm_dim >= 1 and self.latent_dim >= 1 and self.latent_dim % self.simnorm_dim == 0,
+            self.latent_dim % self.simnorm_dim == 0,
             f"model.latent_dim must be a multiple of model.simnorm_dim={self.simnorm_dim}, got {self.latent_dim}.",
         )
+        _require(self.num_bins >= 2, f"model.num_bins must be at least 2, got {self.num_bins}.")
+        _require(self.bin_min < self.bin_max, "model.bin_min must be below model.bin_max.")
         _require(self.log_std_min < self.log_std_max, "model.log_std_min must be below model.log_std_max.")
+        _require_choice("model.activation", self.activation, ("mish", "silu", "relu"))
         _require(0 <= self.dropout < 1, f"model.dropout must be in [0, 1), got {self.dropout}.")
 
 
@@ -71,8 +81,7 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         group = "reanalyze" if isinstance(self, ReanalyzeConfig) else "planner"
-        for name in ("horizon", "iterations", "num_elites"):
-            _require(getattr(self, name) >= 1, f"{group}.{name} must be at least 1, got {getattr(self, name)}.")
+        _require_positive(f"{group}.", self, "horizon", "iterations", "num_elites")
         _require(
             self.num_elites <= self.num_samples,
             f"{group}.num_elites must be at most {group}.num_samples={self.num_samples}, got {self.num_elites}.",
@@ -81,7 +90,19 @@ class PlannerConfig:
             0 <= self.num_proposals < self.num_samples,
             f"{group}.num_proposals must be in [0, {self.num_samples}), got {self.num_proposals}.",
         )
+        for name in ("extra_iterations", "inverse_temperature"):
+            _require(getattr(self, name) >= 0, f"{group}.{name} must not be negative, got {getattr(self, name)}.")
+        _require(
+            0 < self.std_min <= self.std_max,
+            f"{group}.std_min must be in (0, {group}.std_max={self.std_max}], got {self.std_min}.",
+        )
         _require_choice(f"{group}.score", self.score, ("final", "mean", "adaptive"))
+        _require(
+            self.score != "adaptive" or self.beta >= 0,
+            f"{group}.beta must not be negative with {group}.score=adaptive, got {self.beta}.",
+        )
+        for name in ("first_action", "eval_first_action"):
+            _require_choice(f"{group}.{name}", getattr(self, name), ("elite", "mean", "best"))
 
 
 @dataclass(frozen=True)
@@ -102,7 +123,11 @@ class ReanalyzeConfig(PlannerConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _require(self.every >= 0, f"reanalyze.every must not be negative, got {self.every}; 0 turns reanalyze off.")
-        _require(self.num_slices >= 1, f"reanalyze.num_slices must be at least 1, got {self.num_slices}.")
+        _require_positive("reanalyze.", self, "num_slices")
+        _require(
+            self.proposal_log_std_min < self.proposal_log_std_max,
+            "reanalyze.proposal_log_std_min must be below reanalyze.proposal_log_std_max.",
+        )
 
 
 @dataclass(frozen=True)
@@ -123,7 +148,12 @@ class LossConfig:
     """Default: from the episode length (0.99 for DMC)."""
 
     def __post_init__(self) -> None:
-        _require(self.slice_len >= 1, f"loss.slice_len must be at least 1, got {self.slice_len}.")
+        _require_positive("loss.", self, "slice_len")
+        _require(0 < self.rho <= 1, f"loss.rho must be in (0, 1], got {self.rho}.")
+        _require(0 <= self.tau <= 1, f"loss.tau must be in [0, 1], got {self.tau}.")
+        _require(
+            self.discount is None or 0 < self.discount <= 1, f"loss.discount must be in (0, 1], got {self.discount}."
+        )
         _require_choice("loss.kl_direction", self.kl_direction, ("backward", "forward"))
 
 
@@ -140,9 +170,12 @@ class OptimConfig:
     grad_clip_norm: float = 20.0
 
     def __post_init__(self) -> None:
-        for name in ("batch_size", "updates_per_decision"):
-            _require(getattr(self, name) >= 1, f"optim.{name} must be at least 1, got {getattr(self, name)}.")
-        _require(self.lr > 0, f"optim.lr must be positive, got {self.lr}.")
+        _require_positive("optim.", self, "batch_size", "updates_per_decision")
+        for name in ("lr", "grad_clip_norm"):
+            _require(getattr(self, name) > 0, f"optim.{name} must be positive, got {getattr(self, name)}.")
+        _require(
+            self.encoder_lr_scale >= 0, f"optim.encoder_lr_scale must not be negative, got {self.encoder_lr_scale}."
+        )
 
 
 @dataclass(frozen=True)
@@ -161,7 +194,11 @@ class ReplayConfig:
     """Updates without the policy loss after the seed phase. Default: as many as there were seed decisions."""
 
     def __post_init__(self) -> None:
-        _require(self.capacity >= 1, f"replay.capacity must be at least 1, got {self.capacity}.")
+        _require_positive("replay.", self, "capacity")
+        _require(
+            self.pretrain_updates is None or self.pretrain_updates >= 0,
+            f"replay.pretrain_updates must not be negative, got {self.pretrain_updates}.",
+        )
         _require_choice("replay.insertion", self.insertion, ("step", "episode"))
         _require_choice("replay.uniform_over", self.uniform_over, ("episodes", "starts"))
         _require_choice("replay.device", self.device, ("cpu", "run"))
@@ -205,9 +242,20 @@ class TrainConfig:
         _require_choice("device", self.device.split(":")[0], ("auto", "cpu", "cuda"))
         _require_choice("compile", self.compile, ("auto", "off", "default"))
         _require_choice("logger", self.logger, ("none", "tensorboard", "wandb"))
-        for name in ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every"):
-            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}.")
+        _require_positive("", self, "num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every")
         _require(self.threads is None or self.threads >= 1, f"threads must be at least 1, got {self.threads}.")
+        episode = task.decision_steps_per_episode
+        _require(
+            self.loss.slice_len <= episode,
+            f"loss.slice_len must fit into an episode of {episode} decisions, got {self.loss.slice_len}.",
+        )
+        # Fewer rows may hold nothing but the end of one episode and the beginning of the next.
+        least = episode * self.num_envs if self.replay.insertion == "episode" else 0
+        least = max(least, 2 * self.loss.slice_len * self.num_envs)
+        _require(
+            self.replay.capacity >= least,
+            f"replay.capacity must be at least {least} with these settings, got {self.replay.capacity}.",
+        )
         seed_env_steps = self.seed_decisions * task.action_repeat
         _require(
             self.total_env_steps > seed_env_steps,
@@ -220,7 +268,7 @@ class TrainConfig:
             f"got {self.seed_decisions}.",
         )
         if self.replay.insertion == "episode":
-            per_episode = task.decision_steps_per_episode * self.num_envs
+            per_episode = episode * self.num_envs
             _require(
                 self.seed_decisions >= per_episode,
                 f"replay.seed_decisions must cover an episode of every environment ({per_episode} decisions) with "

@@ -69,6 +69,8 @@ def evaluate(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
     num_envs = max(env.batch_size.numel(), 1)
+    if policy_device is not None and torch.device(policy_device) == env.device:
+        policy_device = None
     returns: list[Tensor] = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while len(returns) * num_envs < episodes:

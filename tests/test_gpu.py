@@ -1,0 +1,82 @@
+"""The whole chain on a CUDA device."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchrl_etdmpc.testing import random_slices
+from torchrl_etdmpc.training import (
+    TrainConfig,
+    build_agent,
+    build_collector,
+    build_reanalyze,
+    build_replay,
+    evaluate,
+    preset,
+)
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+
+def small(**replay) -> TrainConfig:
+    base = preset("cpu")
+    return dataclasses.replace(
+        base,
+        task="pendulum-swingup",
+        compile="off",
+        total_env_steps=1000,
+        replay=dataclasses.replace(base.replay, seed_decisions=60, **replay),
+    )
+
+
+@pytest.mark.parametrize("storage", ["cpu", "run"])
+def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
+    from torchrl_etdmpc.envs import make_dmc_env
+
+    config = small(device=storage)
+    env = make_dmc_env(config.task, seed=0)
+    agent = build_agent(config, 3, 1, "cuda")
+    replay = build_replay(config, "cuda")
+    reanalyze = build_reanalyze(config, agent, replay)
+    collector = build_collector(config, agent, env, replay)
+    for _ in range(70):
+        collector.step()
+    for _ in range(2 * reanalyze.interval):
+        metrics = agent.updater.step(replay.sample().to("cuda").reshape(-1, config.loss.slice_len))
+    assert reanalyze.refreshed > 0
+    assert all(value.isfinite() and value.is_cuda for value in metrics.values())
+    eval_env = env.append_transform(agent.eval_planner.make_tensordict_primer())
+    assert evaluate(eval_env, agent.eval_planner, episodes=1, policy_device="cuda").isfinite().all()
+
+
+@pytest.mark.parametrize("compile_mode", ["off", "default"])
+def test_a_plan_and_an_update_agree_with_the_cpu(compile_mode):
+    torch.manual_seed(0)
+    config = dataclasses.replace(small(), compile=compile_mode)
+    agents = {device: build_agent(config, 3, 1, device) for device in ("cpu", "cuda")}
+    agents["cuda"].world_model.load_state_dict(agents["cpu"].world_model.state_dict())
+    observation = torch.randn(5, 3)
+    noise = agents["cpu"].planner.draw_noise(5)
+    plans = {
+        device: agent.planner.plan(observation.to(device), noise=type(noise)(*(draw.to(device) for draw in noise)))
+        for device, agent in agents.items()
+    }
+    torch.testing.assert_close(plans["cuda"].loc.cpu(), plans["cpu"].loc, atol=1e-2, rtol=1e-2)
+    batch = random_slices(3, 1, num_slices=8)
+    metrics = {device: agent.updater.step(batch.to(device)) for device, agent in agents.items()}
+    for name in ("loss_consistency", "loss_reward"):
+        torch.testing.assert_close(metrics["cuda"][name].cpu(), metrics["cpu"][name], atol=1e-3, rtol=1e-2)
+
+
+def test_compiled_replays_draw_new_noise():
+    config = dataclasses.replace(small(), compile="default")
+    planner = build_agent(config, 3, 1, "cuda").planner
+    observation = torch.zeros(1, 3, device="cuda")
+    actions = torch.cat([planner.plan(observation).action for _ in range(8)])
+    assert actions.std(0).min() > 0
