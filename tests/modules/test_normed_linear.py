@@ -11,7 +11,7 @@ from torchrl_etdmpc.modules.normed_linear import INIT_STD
 
 @pytest.fixture(autouse=True)
 def seeded():
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
 

@@ -40,7 +40,7 @@ class CountingPlanner(TensorDictModuleBase):
         self.exploration_types.append(exploration_type())
         if self.before_answering is not None:
             self.before_answering()
-        tags = 1000.0 * len(self.calls) + torch.arange(len(tensordict)).unsqueeze(-1)
+        tags = 1000.0 * len(self.calls) + torch.arange(len(tensordict)).unsqueeze(-1) + self.weight.sum()
         tensordict["action"] = tags.expand(-1, ACTION_DIM).clone()
         tensordict["plan"] = TensorDict(
             {
@@ -356,9 +356,11 @@ def test_the_targets_follow_the_planner_s_present_weights():
 
 def test_no_gradient_is_kept():
     buffer = make_buffer(40)
-    make_reanalyze(buffer, make_planner())
+    reanalyze = make_reanalyze(buffer)
     batch = buffer.sample()
-    assert not any(value.requires_grad for value in batch.values(True, True))
+    assert reanalyze.planner(batch.clone())["plan", "loc"].requires_grad
+    for rows_of in (batch, content(buffer)):
+        assert not any(value.requires_grad for value in rows_of.values(True, True))
 
 
 def test_the_sampler_still_draws_whole_slices():

@@ -36,7 +36,7 @@ class ReanalyzeTransform(Transform):
 
     Attributes:
         enabled (bool): whether samples are re-planned; pretraining on random data turns it off.
-        refreshed (int): rows whose target was renewed in the buffer, so far.
+        refreshed (int): rows whose target was renewed in the buffer, so far (every copy in a sample counts).
         stale (int): rows that had been overwritten before their new target arrived, so far.
         target_age (Tensor): mean age, in updates, of the targets of the last sample before it was refreshed.
 

@@ -48,7 +48,8 @@ class StepSliceSampler(Sampler):
 
     The sampler follows the trajectories as they are written instead of searching the storage for borders, so the cost
     of a sample depends on the number of trajectories in the buffer (two thousand for a million DMC steps) and not on
-    the number of rows.
+    the number of rows. A trajectory is cut where the spacing of its rows changes, so flatten the batches ``[N, T]``
+    that TorchRL's collectors make of N environments time first: ``batch.transpose(0, 1).reshape(-1)``.
 
     Args:
         slice_len (int): T, transitions per slice.

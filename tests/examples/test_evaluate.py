@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import os
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+pytest.importorskip("hydra")
+
+from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.training import (  # noqa: E402
+    BarePolicy,
+    TrainConfig,
+    build_agent,
+    evaluate,
+    load_agent,
+    save_checkpoint,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = ROOT / "examples" / "evaluate.py"
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained agent of small networks, as if 400 env steps had been made."""
+    config = TrainConfig.from_dict(
+        {
+            "task": "cartpole-balance",
+            "compile": "off",
+            "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+            "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+        }
+    )
+    torch.manual_seed(0)
+    agent = build_agent(config, observation_dim=5, action_dim=1)
+    return save_checkpoint(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 400})
+
+
+@pytest.fixture
+def run_main(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> Callable[..., tuple[str | None, str, str]]:
+    """Runs the script in this process, in an empty directory; returns its exit message, stdout and stderr."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> tuple[str | None, str, str]:
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+        message = None
+        try:
+            runpy.run_path(str(SCRIPT), run_name="__main__")
+        except SystemExit as error:
+            message = error.code
+        return message, *capfd.readouterr()
+
+    return run
+
+
+def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
+    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [sys.executable, *command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+
+
+def closing_line(returns: torch.Tensor, policy: str) -> str:
+    return (
+        f"cartpole-balance ({policy}, trained for 400 env steps): return {returns.mean():.1f} "
+        f"+- {returns.std(correction=0):.1f} over {len(returns)} episodes"
+    )
+
+
+def test_the_planner_s_returns_are_printed_in_one_line(tmp_path, checkpoint):
+    process = run_process(str(SCRIPT), f"checkpoint={checkpoint}", "episodes=2", "seed=5", "device=cpu", cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert process.stderr == ""
+    assert list(tmp_path.iterdir()) == []
+    agent, _, _ = load_agent(checkpoint)
+    env = make_dmc_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
+    env = env.append_transform(agent.eval_planner.make_tensordict_primer())
+    torch.manual_seed(5)
+    assert process.stdout == closing_line(evaluate(env, agent.eval_planner, episodes=2), "planner") + "\n"
+
+
+def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint, run_main):
+    message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=2", "policy=bare", "seed=5", "device=cpu")
+    assert (message, err) == (None, "")
+    agent, _, _ = load_agent(checkpoint)
+    env = make_dmc_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
+    assert out == closing_line(evaluate(env, BarePolicy(agent.world_model), episodes=2), "bare") + "\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_main):
+    message, out, err = run_main(
+        f"checkpoint={checkpoint}", "task=cartpole-swingup", "episodes=1", "policy=bare", "device=cpu"
+    )
+    assert (message, err) == (None, "")
+    assert out.startswith("cartpole-swingup (bare, trained for 400 env steps): return ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "Missing mandatory value: checkpoint"),
+        (["checkpoint=nowhere.pt"], "nowhere.pt is not a file; pass a checkpoint such as "),
+        (["checkpoint=noise.pt"], "noise.pt is not a readable checkpoint ("),
+        (["checkpoint=other.pt"], "other.pt is a PyTorch file but not a checkpoint of torchrl_etdmpc."),
+        (["checkpoint=GOOD", "task=walker-walk"], "GOOD was trained with observation size 5 and action size 1, the "),
+        (["checkpoint=GOOD", "task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
+        (["checkpoint=GOOD", "episodes=0"], "episodes must be at least 1, got 0."),
+        (["checkpoint=GOOD", "episodes=many"], "episodes must be of type int, got 'many'."),
+        (["checkpoint=GOOD", "policy=best"], "policy must be planner or bare, got 'best'."),
+        (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4, got 'film.avi'."),
+        (["checkpoint=GOOD", "epsiodes=2"], "Could not override 'epsiodes'. "),
+        (["checkpoint=GOOD", "device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use "),
+    ],
+)
+def test_a_bad_input_ends_in_one_line(tmp_path, monkeypatch, checkpoint, run_main, arguments, message):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    (tmp_path / "noise.pt").write_bytes(b"\x80\x02noise")
+    torch.save({"weight": torch.ones(3)}, tmp_path / "other.pt")
+    error, out, err = run_main(*(argument.replace("GOOD", str(checkpoint)) for argument in arguments))
+    assert error.startswith("error: " + message.replace("GOOD", str(checkpoint)))
+    assert "\n" not in error
+    assert (out, err) == ("", "")
+    assert {path.name for path in tmp_path.iterdir()} == {"noise.pt", "other.pt"}
+
+
+def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, monkeypatch, checkpoint, run_main):
+    def render_frame(env):
+        raise RuntimeError("cannot render: there is no display; set MUJOCO_GL=egl before Python starts.")
+
+    def no_episodes(*args, **options):
+        raise AssertionError("the episodes had begun")
+
+    monkeypatch.setattr("torchrl_etdmpc.envs.render_frame", render_frame)
+    monkeypatch.setattr("torchrl_etdmpc.training.evaluate", no_episodes)
+    error, out, err = run_main(f"checkpoint={checkpoint}", "video=film.mp4", "device=cpu")
+    assert error == "error: cannot render: there is no display; set MUJOCO_GL=egl before Python starts."
+    assert (out, err) == ("", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Runs the script with frames that are quickly drawn.
+SMALL_FRAMES = """
+import functools, runpy, sys
+import torchrl_etdmpc.envs
+torchrl_etdmpc.envs.render_frame = functools.partial(torchrl_etdmpc.envs.render_frame, height=48, width=64)
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def test_a_film_shows_every_decision_of_the_first_episode(tmp_path, checkpoint):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    arguments = (f"checkpoint={checkpoint}", "video=films/cartpole.mp4", "episodes=2", "policy=bare", "device=cpu")
+    process = run_process("-c", SMALL_FRAMES, str(SCRIPT), *arguments, cwd=tmp_path)
+    if "cannot render" in process.stderr:
+        assert process.stderr.startswith("error: ")
+        assert process.stderr.count("\n") == 1
+        pytest.skip(process.stderr.strip())
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.endswith("over 2 episodes; film in films/cartpole.mp4\n")
+    assert process.stdout.count("\n") == 1
+    film = tmp_path / "films" / "cartpole.mp4"
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [film]
+    frames, seconds = ffmpeg.count_frames_and_secs(str(film))
+    assert (frames, seconds) == (500, pytest.approx(10, abs=0.1))
+    reader = ffmpeg.read_frames(str(film))
+    assert next(reader)["size"] == (64, 48)
+    picture = torch.frombuffer(bytearray(next(reader)), dtype=torch.uint8)
+    reader.close()
+    assert picture.float().std() > 5  # there is something to see

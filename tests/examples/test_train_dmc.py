@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.machinery
+import importlib.util
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+pytest.importorskip("hydra")
+
+from torchrl_etdmpc.training import PRESETS, TrainConfig, preset, read_checkpoint  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = ROOT / "examples" / "train_dmc.py"
+
+# 40 seed decisions and 20 more; two evaluations of a whole episode each.
+SMALL_RUN = (
+    "task=cartpole-balance preset=cpu seed=3 device=cpu compile=off total_env_steps=120 log_every=20 eval_every=100000 "
+    "eval_episodes=1 model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 planner.horizon=2 planner.num_samples=8 "
+    "planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 reanalyze.num_samples=6 reanalyze.num_elites=3 "
+    "reanalyze.iterations=1 optim.batch_size=4 replay.seed_decisions=40 replay.pretrain_updates=4"
+).split()
+
+
+def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
+    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [sys.executable, *command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+
+
+def file_hashes(directory: Path) -> dict[str, str]:
+    files = (path for path in directory.rglob("*") if path.is_file())
+    return {str(path.relative_to(directory)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """A small run, started in an empty directory like a user would."""
+    directory = tmp_path_factory.mktemp("empty")
+    return directory, run_process(str(SCRIPT), *SMALL_RUN, "run_dir=runs/first", cwd=directory)
+
+
+@pytest.fixture
+def run_main(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> Iterator[Callable[..., str]]:
+    """Runs the script in this process, in an empty directory; returns what it leaves on stderr when it fails."""
+    precision, threads = torch.get_float32_matmul_precision(), torch.get_num_threads()
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+        with pytest.raises(SystemExit) as caught:
+            runpy.run_path(str(SCRIPT), run_name="__main__")
+        out, err = capfd.readouterr()
+        assert out == ""
+        assert isinstance(caught.value.code, str)  # Python prints it on stderr and exits with 1
+        return err + caught.value.code + "\n"
+
+    yield run
+    torch.set_float32_matmul_precision(precision)
+    torch.set_num_threads(threads)
+
+
+def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(finished):
+    directory, process = finished
+    assert process.returncode == 0, process.stderr
+    run_dir = Path("runs", "first")
+    expected = {
+        "config.yaml",
+        "train.csv",
+        "eval.csv",
+        "summary.json",
+        "curve.png",
+        str(Path("checkpoints", "last.pt")),
+    }
+    assert set(file_hashes(directory)) == {str(run_dir / name) for name in expected}
+    summary = json.loads((directory / run_dir / "summary.json").read_text())
+    assert re.fullmatch(
+        rf"cartpole-balance: return {summary['final_return']:.1f} after 120 env steps in \d+ s; "
+        rf"curve, tables and checkpoint are in {re.escape(str(run_dir))}\n",
+        process.stdout,
+    )
+    assert "Traceback" not in process.stderr
+    assert "Warning" not in process.stderr
+
+
+def test_the_files_of_a_run_agree_on_what_was_done(finished):
+    run_dir = finished[0] / "runs" / "first"
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert (summary["task"], summary["preset"], summary["seed"]) == ("cartpole-balance", "cpu", 3)
+    with (run_dir / "eval.csv").open(newline="") as file:
+        evaluations = list(csv.DictReader(file))
+    assert [row["env_steps"] for row in evaluations] == ["0", "120"]
+    assert float(evaluations[-1]["return_mean"]) == summary["final_return"]
+    assert 0 < summary["final_return"] <= 1000
+    with (run_dir / "train.csv").open(newline="") as file:
+        assert [row["env_steps"] for row in csv.DictReader(file)] == ["100", "120"]
+    content = read_checkpoint(run_dir / "checkpoints" / "last.pt")
+    assert content["counters"]["env_steps"] == summary["env_steps"] == 120
+    assert content["counters"]["updates"] == 4 + 20
+    assert content["config"]["seed"] == 3
+
+
+def test_the_overrides_arrive_and_the_preset_gives_the_rest(finished):
+    yaml = pytest.importorskip("yaml")
+    written = yaml.safe_load((finished[0] / "runs" / "first" / "config.yaml").read_text())
+    config, base = TrainConfig.from_dict(written), preset("cpu")
+    assert (config.model.latent_dim, config.planner.num_samples, config.replay.seed_decisions) == (16, 8, 40)
+    assert config.run_dir == "runs/first"
+    assert config.loss == base.loss
+    assert config.reanalyze.every == base.reanalyze.every
+    assert config.threads == base.threads
+
+
+def test_the_same_run_directory_is_refused_and_not_touched(finished):
+    directory, _ = finished
+    before = file_hashes(directory)
+    again = run_process(str(SCRIPT), *SMALL_RUN, "run_dir=runs/first", cwd=directory)
+    assert again.returncode == 1
+    assert again.stdout == ""
+    run_dir = Path("runs", "first")
+    expected = f"error: run_dir={run_dir} already holds a run; choose another run_dir or remove it.\n"
+    assert again.stderr == expected
+    assert file_hashes(directory) == before
+
+
+# Runs the script as if the package had not been installed.
+WITHOUT = """
+import importlib.machinery, runpy, sys
+find = importlib.machinery.PathFinder.find_spec
+missing = sys.argv[1]
+importlib.machinery.PathFinder.find_spec = staticmethod(
+    lambda name, path=None, target=None: None if name.partition(".")[0] == missing else find(name, path, target))
+sys.argv = sys.argv[2:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(
+    ("package", "message"),
+    [
+        ("dm_control", "dm_control tasks need dm-control, which is missing; run: pip install torchrl_etdmpc[dmc]"),
+        ("hydra", "the examples need hydra-core; run: pip install torchrl_etdmpc[train]"),
+    ],
+)
+def test_a_missing_package_is_named_in_one_line(tmp_path, package, message):
+    process = run_process("-c", WITHOUT, package, str(SCRIPT), *SMALL_RUN, cwd=tmp_path)
+    assert process.returncode == 1
+    assert process.stdout == ""
+    assert process.stderr == f"error: {message}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+REFUSED = [
+    (["task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
+    (["task=null"], "task must be of type str, got None."),
+    (["preset=fast"], f"unknown preset 'fast'; choose one of {', '.join(PRESETS)}."),
+    (["planner.horizn=3"], "Could not override 'planner.horizn'. "),
+    (["+planner.horizn=3"], "unknown setting planner.horizn; known: horizon, "),
+    (["planner.horizon"], "Error parsing override 'planner.horizon' missing EQUAL"),
+    (["planner.horizon=three"], "planner.horizon must be of type int, got 'three'."),
+    (["planner.horizon=0"], "planner.horizon must be at least 1, got 0."),
+    (["planner.num_elites=600"], "planner.num_elites must be at most planner.num_samples=512, got 600."),
+    (["planner.first_action=worst"], "planner.first_action must be one of elite, mean, best, got 'worst'."),
+    (["planner.std_min=-1"], "planner.std_min must be in (0, planner.std_max=2.0], got -1.0."),
+    (["model.latent_dim=20"], "model.latent_dim must be a multiple of model.simnorm_dim=8, got 20."),
+    (["model.activation=tanh"], "model.activation must be one of mish, silu, relu, got 'tanh'."),
+    (["total_env_steps=5000"], "total_env_steps must exceed the seed phase of 5000 env steps, got 5000; raise "),
+    (["replay.capacity=2"], "replay.capacity must be at least 6 with these settings, got 2."),
+    (["num_envs=0"], "num_envs must be at least 1, got 0."),
+    (["resume=true"], "resume is not implemented yet; start a new run_dir"),
+    (["logger=wandb"], "logger=wandb needs wandb, which is not installed; run `pip install torchrl_etdmpc[wandb]`."),
+    (["device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."),
+    (["device=cuda:first"], "Invalid device string: 'cuda:first'"),
+    (["run_dir=taken/run"], "run_dir=taken/run cannot be written (Not a directory); choose a directory that you can "),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
+def test_a_bad_input_ends_in_one_line_and_leaves_nothing_behind(tmp_path, monkeypatch, run_main, arguments, message):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find_spec(name))
+    if arguments == ["run_dir=taken/run"]:
+        (tmp_path / "taken").write_text("a file, not a folder")
+    before = file_hashes(tmp_path)
+    err = run_main(*arguments)
+    assert err.startswith(f"error: {message}")
+    assert err.count("\n") == 1
+    assert file_hashes(tmp_path) == before
+    assert all(path.is_file() for path in tmp_path.iterdir())
+
+
+def test_a_traceback_is_shown_on_request(tmp_path, monkeypatch, run_main):
+    assert run_main("planner.horizon=0").startswith("error: planner.horizon")
+    monkeypatch.setenv("TORCHRL_ETDMPC_TRACEBACK", "1")
+    with pytest.raises(ValueError, match=r"^planner\.horizon must be at least 1, got 0\.$"):
+        run_main("planner.horizon=0")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_etdmpc.planners.scores import FinalScore, MeanScore
+from torchrl_etdmpc.testing import random_slices
+from torchrl_etdmpc.training import (
+    Agent,
+    TrainConfig,
+    build_agent,
+    build_planner,
+    build_reanalyze,
+    build_replay,
+    build_world_model,
+    preset,
+    resolve_compile,
+    resolve_device,
+)
+from torchrl_etdmpc.training.config import PlannerConfig, ReanalyzeConfig
+
+OBSERVATION_DIM, ACTION_DIM = 5, 2
+PLANNERS = ("planner", "eval_planner", "reanalyze_planner")
+
+
+def tiny_config(**changes: Any) -> TrainConfig:
+    """Networks and planners that cost next to nothing; a group is changed by a dictionary."""
+    values: dict[str, Any] = {
+        "compile": "off",
+        "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+        "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 2},
+        "reanalyze": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 2},
+    }
+    for name, change in changes.items():
+        values[name] = {**values.get(name, {}), **change} if isinstance(change, dict) else change
+    return TrainConfig.from_dict(values)
+
+
+def tiny_agent(action_dim: int = ACTION_DIM, **changes: Any) -> Agent:
+    torch.manual_seed(0)
+    return build_agent(tiny_config(**changes), OBSERVATION_DIM, action_dim)
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, dict]]:
+    """Records what would be compiled, and with which options, without compiling it."""
+    calls: list[tuple[Any, dict]] = []
+
+    def compile(function: Any, **options: Any) -> Any:
+        calls.append((function, options))
+        return function
+
+    monkeypatch.setattr(torch, "compile", compile)
+    return calls
+
+
+@pytest.mark.parametrize("name", ["efficient-tdmpc-utd4", "bmpc", "cpu"])
+def test_the_networks_have_the_sizes_of_the_preset(name):
+    config = preset(name).model
+    model = build_world_model(config, OBSERVATION_DIM, ACTION_DIM)
+    weights = {name: parameter.shape for name, parameter in model.named_parameters()}
+    assert weights["encoder.hidden.0.weight"][-2:] == (OBSERVATION_DIM, config.encoder_dim)
+    assert weights["dynamics.hidden.1.weight"] == (config.num_dynamics, config.mlp_dim, config.mlp_dim)
+    assert weights["value_head.output.weight"] == (config.num_values, config.mlp_dim, config.num_bins)
+    assert weights["policy.output.weight"][-1] == 2 * ACTION_DIM
+    assert model.encode(torch.zeros(OBSERVATION_DIM)).shape == (config.latent_dim,)
+    assert (model.bins[0].item(), model.bins[-1].item(), len(model.bins)) == (-10, 10, 101)
+    assert model.policy.log_std_bounds == (-3, 1)
+    assert model.termination_head is None
+
+
+def test_every_setting_of_the_planner_arrives():
+    values = {"horizon": 4, "num_samples": 20, "num_elites": 5, "num_proposals": 3, "iterations": 7}
+    values |= {"inverse_temperature": 0.7, "std_min": 0.1, "std_max": 1.5}
+    values |= {"first_action": "mean", "eval_first_action": "elite"}
+    config = PlannerConfig(**values, score="final", beta=2.0)
+    world_model = build_world_model(tiny_config().model, OBSERVATION_DIM, ACTION_DIM)
+    planner = build_planner(world_model, config, discount=0.9, warm_start=True)
+    assert {name: getattr(planner, name) for name in values} == values
+    assert planner.score == FinalScore(beta=2.0)
+    assert planner.discount == 0.9
+
+
+def test_the_paper_s_planners_are_built_from_its_preset():
+    config = dataclasses.replace(preset("efficient-tdmpc-utd4"), compile="off", model=tiny_config().model)
+    agent = build_agent(config, OBSERVATION_DIM, ACTION_DIM)
+    for planner in (agent.planner, agent.eval_planner):
+        assert (planner.horizon, planner.num_samples, planner.num_elites, planner.num_proposals) == (6, 512, 64, 24)
+        assert planner.score == MeanScore(beta=0.0)
+    planner = agent.reanalyze_planner
+    assert (planner.horizon, planner.num_samples, planner.num_elites, planner.num_proposals) == (3, 64, 8, 3)
+    assert planner.score == FinalScore(beta=0.0)
+
+
+def test_the_discount_follows_from_the_episode_s_length_unless_it_is_given():
+    for agent, expected in ((tiny_agent(), 0.99), (tiny_agent(loss={"discount": 0.9}), 0.9)):
+        assert agent.loss.discount.item() == pytest.approx(expected)
+        assert [getattr(agent, name).discount for name in PLANNERS] == pytest.approx([expected] * 3)
+
+
+def test_the_loss_and_the_updater_take_their_settings():
+    loss = {"consistency_coef": 1.0, "reward_coef": 2.0, "value_coef": 3.0, "entropy_coef": 4.0, "rho": 0.25}
+    loss |= {"termination_coef": 5.0}
+    agent = tiny_agent(
+        model={"termination": True},
+        loss={**loss, "kl_direction": "forward", "tau": 0.125},
+        optim={"lr": 0.5, "encoder_lr_scale": 0.25, "grad_clip_norm": 7.0},
+    )
+    assert {name: getattr(agent.loss, name).item() for name in loss} == loss
+    assert (agent.loss.kl_direction, agent.loss.scale_tau) == ("forward", 0.125)
+    assert agent.updater.target_update.eps == 1 - 0.125
+    assert agent.updater.grad_clip_norm == 7
+    assert [group["lr"] for group in agent.updater.model_optimizer.param_groups] == [0.125, 0.5]
+
+
+def test_loss_and_planners_share_one_world_model():
+    agent = tiny_agent(optim={"lr": 0.1})
+    assert all(getattr(agent, name).world_model is agent.world_model for name in PLANNERS)
+    assert agent.loss.world_model is agent.world_model
+    observation = torch.randn(4, OBSERVATION_DIM)
+    noise = {name: getattr(agent, name).draw_noise(4) for name in PLANNERS}
+    plan = {name: getattr(agent, name).plan(observation, noise=noise[name]) for name in PLANNERS}
+    again = {name: getattr(agent, name).plan(observation, noise=noise[name]) for name in PLANNERS}
+    agent.updater.step(random_slices(OBSERVATION_DIM, ACTION_DIM))
+    for name in PLANNERS:
+        after = getattr(agent, name).plan(observation, noise=noise[name])
+        assert torch.equal(plan[name].mean, again[name].mean)
+        assert not torch.equal(plan[name].mean, after.mean), f"the {name} did not see the update"
+
+
+def test_acting_planners_start_warm_and_reanalyze_starts_cold_with_widened_bounds():
+    agent = tiny_agent()
+    for planner in (agent.planner, agent.eval_planner):
+        assert planner.warm_start
+        assert "plan_mean" in planner.in_keys
+        assert planner.proposal_log_std_bounds is None
+    assert not agent.reanalyze_planner.warm_start
+    assert agent.reanalyze_planner.in_keys == ["observation"]
+    assert agent.reanalyze_planner.proposal_log_std_bounds == (-2, 1)
+    other = tiny_agent(reanalyze={"proposal_log_std_min": -1.5, "proposal_log_std_max": 0.5})
+    assert other.reanalyze_planner.proposal_log_std_bounds == (-1.5, 0.5)
+
+
+def test_the_two_acting_planners_are_apart_so_that_an_evaluation_disturbs_nothing():
+    agent = tiny_agent()
+    assert agent.planner is not agent.eval_planner
+
+
+@pytest.mark.parametrize(("action_dim", "extra"), [(20, 0), (21, 2)])
+def test_more_than_20_action_dimensions_add_iterations_to_acting_and_to_reanalyze(action_dim, extra):
+    agent = tiny_agent(action_dim, planner={"iterations": 3}, reanalyze={"iterations": 4})
+    assert agent.planner.iterations == agent.eval_planner.iterations == 3 + extra
+    assert agent.reanalyze_planner.iterations == 4 + extra
+
+
+@pytest.mark.parametrize(
+    ("changes", "capacity"),
+    [
+        ({"total_env_steps": 20_000}, 10_000),
+        ({"total_env_steps": 20_001}, 10_001),  # the last decision may pass the budget
+        ({"total_env_steps": 20_000, "replay": {"capacity": 3000}}, 3000),
+        ({"total_env_steps": 4_000_000}, 1_000_000),
+    ],
+)
+def test_the_buffer_holds_the_budget_and_no_more_than_its_capacity(changes, capacity):
+    config = tiny_config(**changes)
+    size = build_replay(config).storage.max_size
+    allowance = config.num_envs if capacity < config.replay.capacity else 0
+    assert capacity <= size <= capacity + allowance
+
+
+def test_a_sample_is_a_batch_of_slices():
+    config = tiny_config(optim={"batch_size": 5}, loss={"slice_len": 4}, replay={"uniform_over": "starts"})
+    replay = build_replay(config)
+    steps = torch.arange(30)
+    trajectories = {"traj_ids": steps // 10}
+    replay.extend(TensorDict({"step": steps, "collector": trajectories}, [30]))
+    sample = replay.sample().reshape(-1, 4)
+    assert sample.shape == (5, 4)
+    assert (sample["step"].diff(dim=-1) == 1).all()
+    assert replay.sampler.uniform_over == "starts"
+    assert replay.writer.tracks_generations
+
+
+@pytest.mark.parametrize(("updates", "every", "interval"), [(1, 10, 10), (2, 5, 10), (4, 2, 8)])
+def test_the_reanalyze_interval_counts_decisions(updates, every, interval):
+    # Reanalyze counts samples, and there is one per update.
+    config = tiny_config(optim={"updates_per_decision": updates}, reanalyze={"every": every, "num_slices": 7})
+    agent, replay = build_agent(config, OBSERVATION_DIM, ACTION_DIM), build_replay(config)
+    reanalyze = build_reanalyze(config, agent, replay)
+    assert (reanalyze.interval, reanalyze.num_slices, reanalyze.slice_len) == (interval, 7, 3)
+    assert reanalyze.planner is agent.reanalyze_planner
+    assert reanalyze.replay_buffer is replay
+
+
+def test_reanalyze_can_be_turned_off():
+    config = tiny_config(reanalyze={"every": 0})
+    assert build_reanalyze(config, tiny_agent(), build_replay(config)) is None
+
+
+def test_auto_is_the_cuda_device_where_there_is_one(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert resolve_device("auto") == torch.device("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert resolve_device("auto") == torch.device("cuda")
+    assert resolve_device("cuda:1") == torch.device("cuda", 1)
+    assert resolve_device("cpu") == torch.device("cpu")
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:0"])
+def test_cuda_without_a_device_is_refused(monkeypatch, name):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError) as caught:
+        resolve_device(name)
+    expected = f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
+    assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize(
+    ("setting", "device", "compiler", "mode"),
+    [
+        ("off", "cpu", "g++", None),
+        ("off", "cuda", "g++", None),
+        ("auto", "cpu", "g++", "default"),
+        ("auto", "cpu", "clang++", "default"),
+        ("auto", "cuda", None, "default"),
+        ("default", "cpu", None, "default"),
+    ],
+)
+def test_auto_compiles_where_a_compiler_exists(monkeypatch, setting, device, compiler, mode):
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}" if name == compiler else None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert resolve_compile(setting, torch.device(device)) == mode
+
+
+def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compiled):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.warns(UserWarning) as caught:
+        tiny_agent(compile="auto")
+    assert [str(warning.message) for warning in caught] == [
+        "no C++ compiler found, so nothing is compiled and training is slower; install g++."
+    ]
+    assert compiled == []
+
+
+def test_on_a_cpu_the_planners_of_the_training_loop_are_compiled_and_nothing_else(compiled):
+    agent = tiny_agent(compile="default")
+    owners = [function.__self__ for function, _ in compiled]
+    assert owners == [agent.planner, agent.reanalyze_planner]
+    assert [function.__name__ for function, _ in compiled] == ["plan", "plan"]
+    assert all(options == {"mode": "default", "dynamic": False, "fullgraph": True} for _, options in compiled)
+
+
+def test_nothing_is_compiled_if_it_is_turned_off(compiled):
+    tiny_agent(compile="off")
+    assert compiled == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler")
+def test_a_compiled_agent_plans_like_an_eager_one():
+    eager, fast = tiny_agent(compile="off"), tiny_agent(compile="default")
+    fast.world_model.load_state_dict(eager.world_model.state_dict())
+    for name, states in (("planner", 1), ("reanalyze_planner", 12)):
+        reference, planner = getattr(eager, name), getattr(fast, name)
+        observation, noise = torch.randn(states, OBSERVATION_DIM), reference.draw_noise(states)
+        expected, actual = (p.plan(observation, noise=noise) for p in (reference, planner))
+        for field in ("action", "loc", "scale", "value", "mean"):
+            torch.testing.assert_close(getattr(actual, field), getattr(expected, field), rtol=1e-3, atol=1e-4)
+        written = planner(TensorDict({"observation": observation, "is_init": torch.ones(states, 1).bool()}, [states]))
+        assert written["action"].isfinite().all()
+
+
+def test_the_settings_of_reanalyze_extend_those_of_a_planner():
+    names = {field.name for field in dataclasses.fields(PlannerConfig)}
+    assert names < {field.name for field in dataclasses.fields(ReanalyzeConfig)}

@@ -1,0 +1,276 @@
+from __future__ import annotations
+
+import io
+import pickle
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_etdmpc.testing import random_slices
+from torchrl_etdmpc.training import (
+    Agent,
+    CheckpointError,
+    TrainConfig,
+    build_agent,
+    load_agent,
+    read_checkpoint,
+    save_checkpoint,
+)
+
+OBSERVATION_DIM, ACTION_DIM = 3, 1
+COUNTERS = {"env_steps": 100, "decision_steps": 50, "updates": 3, "wall_time_s": 1.5}
+
+
+def make_config(mlp_dim: int = 16) -> TrainConfig:
+    sizes = {"latent_dim": 16, "mlp_dim": mlp_dim, "encoder_dim": 16, "num_dynamics": 2}
+    return TrainConfig.from_dict({"task": "pendulum-swingup", "compile": "off", "model": sizes})
+
+
+def train(agent: Agent, updates: int, seed: int) -> None:
+    torch.manual_seed(seed)
+    for _ in range(updates):
+        agent.updater.step(random_slices(OBSERVATION_DIM, ACTION_DIM))
+
+
+def trained_agent(config: TrainConfig) -> Agent:
+    """An agent of which every tensor has left its initial value."""
+    torch.manual_seed(0)
+    agent = build_agent(config, OBSERVATION_DIM, ACTION_DIM)
+    train(agent, 3, seed=1)
+    agent.loss.kl_scale.fill_(2.5)
+    return agent
+
+
+def tensors(agent: Agent) -> dict[str, Tensor]:
+    """All tensors that training goes on from, by name."""
+    found = {f"loss.{name}": value for name, value in agent.loss.state_dict().items()}
+    found |= {f"world_model.{name}": value for name, value in agent.world_model.state_dict().items()}
+    for name, state in agent.updater.state_dict().items():
+        for index, moments in state["state"].items():
+            found |= {f"{name}_optimiser.{index}.{moment}": value for moment, value in moments.items()}
+    return found
+
+
+def torch_bytes(content: Any) -> bytes:
+    file = io.BytesIO()
+    torch.save(content, file)
+    return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Agent, TrainConfig]:
+    """A checkpoint and what it was made of; tests that write make a copy."""
+    config = make_config()
+    agent = trained_agent(config)
+    path = save_checkpoint(tmp_path_factory.mktemp("run") / "checkpoints" / "last.pt", agent, config, COUNTERS)
+    return path, agent, config
+
+
+def refusal(path: Path, read=read_checkpoint) -> str:
+    with pytest.raises(CheckpointError) as caught:
+        read(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "\x1b" not in message
+    assert message.startswith(str(path))
+    return message.removeprefix(str(path)).strip()
+
+
+def test_a_checkpoint_restores_every_tensor_the_configuration_and_the_counters(saved):
+    path, agent, config = saved
+    torch.manual_seed(99)
+    loaded, loaded_config, counters = load_agent(path)
+    expected, actual = tensors(agent), tensors(loaded)
+    for part in ("target_value_params", "kl_scale", "world_model.version", "model_optimiser.0.exp_avg_sq"):
+        assert any(part in name for name in expected), f"the test would not notice that {part} is missing"
+    assert any(name.startswith("policy_optimiser") for name in expected)
+    assert actual.keys() == expected.keys()
+    assert [name for name in expected if not torch.equal(actual[name], expected[name])] == []
+    assert loaded_config == config
+    assert counters == COUNTERS
+    assert loaded.updater.updates == 3
+    assert loaded.loss.kl_scale == 2.5
+
+
+def test_the_saved_tensors_differ_from_those_of_a_new_agent(saved):
+    _, agent, config = saved
+    torch.manual_seed(0)
+    fresh = tensors(build_agent(config, OBSERVATION_DIM, ACTION_DIM))
+    learned = [name for name, _ in agent.loss.named_parameters()] + ["kl_scale"]
+    trained = tensors(agent)
+    unchanged = [name for name in learned if torch.equal(trained[f"loss.{name}"], fresh[f"loss.{name}"])]
+    assert unchanged == []
+
+
+def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(tmp_path):
+    config = make_config()
+    agent = trained_agent(config)
+    loaded, _, _ = load_agent(save_checkpoint(tmp_path / "last.pt", agent, config, COUNTERS))
+    for one in (agent, loaded):
+        train(one, 2, seed=5)
+    expected, actual = tensors(agent), tensors(loaded)
+    assert [name for name in expected if not torch.equal(actual[name], expected[name])] == []
+
+
+def test_a_loaded_agent_s_planners_see_the_loaded_weights(saved):
+    path, agent, _ = saved
+    loaded, _, _ = load_agent(path)
+    observation = torch.randn(2, OBSERVATION_DIM)
+    for name in ("planner", "eval_planner", "reanalyze_planner"):
+        noise = getattr(agent, name).draw_noise(2)
+        plans = [getattr(one, name).plan(observation, noise=noise) for one in (agent, loaded)]
+        assert torch.equal(plans[0].mean, plans[1].mean)
+
+
+def test_the_weights_are_written_once(tmp_path):
+    config = make_config(mlp_dim=128)
+    torch.manual_seed(0)
+    agent = build_agent(config, OBSERVATION_DIM, ACTION_DIM)
+    train(agent, 1, seed=1)
+    size = save_checkpoint(tmp_path / "last.pt", agent, config, COUNTERS).stat().st_size
+    unique = {value.data_ptr(): value.numel() * value.element_size() for value in tensors(agent).values()}
+    weights = sum(parameter.numel() * parameter.element_size() for parameter in agent.world_model.parameters())
+    assert sum(unique.values()) > 3 * weights  # the weights and Adam's two moments
+    assert size < sum(unique.values()) + 0.5 * weights
+
+
+def test_a_checkpoint_leaves_nothing_beside_it_and_makes_its_folder(saved):
+    path, _, _ = saved
+    assert [entry.name for entry in path.parent.iterdir()] == ["last.pt"]
+
+
+def test_a_newer_checkpoint_replaces_the_older(tmp_path, saved):
+    _, agent, config = saved
+    path = tmp_path / "last.pt"
+    for updates in (3, 4):
+        save_checkpoint(str(path), agent, config, {"updates": updates})
+    assert read_checkpoint(path)["counters"] == {"updates": 4}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
+
+
+def test_a_save_that_fails_keeps_the_old_file_and_leaves_no_other(tmp_path, saved, monkeypatch):
+    _, agent, config = saved
+    path = save_checkpoint(tmp_path / "last.pt", agent, config, COUNTERS)
+    before = path.read_bytes()
+
+    def fill_the_disk(content, file):
+        Path(file).write_bytes(before[:1000])
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", fill_the_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(path, agent, config, COUNTERS)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.9, 0.999])
+def test_a_file_that_was_cut_off_is_refused(tmp_path, saved, share):
+    content = saved[0].read_bytes()
+    path = tmp_path / "cut.pt"
+    path.write_bytes(content[: int(share * len(content))])
+    message = refusal(path)
+    assert message.startswith("is not a readable checkpoint (")
+    assert message.endswith("it is cut off, damaged or another kind of file; use another checkpoint.")
+
+
+def test_random_bytes_are_refused_without_a_warning(tmp_path, recwarn):
+    generator = random.Random(0)
+    path = tmp_path / "noise.pt"
+    for number in range(300):
+        start = b"\x80\x02" if number % 3 == 0 else b""  # every third looks like a pickle
+        path.write_bytes(start + generator.randbytes(generator.choice([1, 5, 50, 500])))
+        assert refusal(path).startswith("is not a readable checkpoint (")
+    assert list(recwarn) == []
+
+
+class Code:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self):
+        return Path.mkdir, (self.folder,)
+
+
+@pytest.mark.parametrize("pack", [torch_bytes, pickle.dumps], ids=["PyTorch file", "bare pickle"])
+def test_code_in_a_file_is_refused_and_not_run(tmp_path, pack):
+    path, folder = tmp_path / "code.pt", tmp_path / "made by the code"
+    content = pack({"format": 1, "world_model": Code(folder)})
+    path.write_bytes(content)
+    message = refusal(path)
+    assert message.startswith("is not a readable checkpoint (")
+    assert "weights_only" not in message  # PyTorch's own text tells how to run the code
+    assert not folder.exists()
+    torch.load(io.BytesIO(content), weights_only=False) if pack is torch_bytes else pickle.loads(content)
+    assert folder.exists()  # it was real code
+
+
+@pytest.mark.parametrize(
+    "content", [3, [1, 2], torch.ones(3), {"state_dict": {"weight": torch.ones(2)}}, {"format": 1}]
+)
+def test_another_pytorch_file_is_refused(tmp_path, content):
+    path = tmp_path / "other.pt"
+    torch.save(content, path)
+    assert refusal(path) == "is a PyTorch file but not a checkpoint of torchrl_etdmpc."
+
+
+def edited(saved: tuple, path: Path, **changes: Any) -> Path:
+    """A copy of the checkpoint with other entries; ``None`` removes one."""
+    content = read_checkpoint(saved[0]) | changes
+    torch.save({name: value for name, value in content.items() if value is not None}, path)
+    return path
+
+
+def test_another_format_is_refused(tmp_path, saved):
+    path = edited(saved, tmp_path / "new.pt", format=2)
+    assert refusal(path) == "has checkpoint format 2; this version reads format 1."
+
+
+def test_a_checkpoint_that_lacks_entries_is_refused_with_their_names(tmp_path, saved):
+    path = edited(saved, tmp_path / "part.pt", optimisers=None, counters=None)
+    assert refusal(path) == "is not a whole checkpoint: it lacks counters, optimisers."
+
+
+@pytest.mark.parametrize("name", ["missing.pt", "."])
+def test_a_path_that_is_no_file_is_refused(tmp_path, name):
+    path = tmp_path / name
+    assert refusal(path) == "is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt."
+
+
+@pytest.mark.parametrize("sizes", [(24, 6), (OBSERVATION_DIM, 6), (24, ACTION_DIM)])
+def test_an_environment_of_another_size_is_refused_with_the_task_that_fits(saved, sizes):
+    message = refusal(saved[0], lambda path: load_agent(path, observation_dim=sizes[0], action_dim=sizes[1]))
+    assert message == (
+        f"was trained with observation size {OBSERVATION_DIM} and action size {ACTION_DIM}, the environment has "
+        f"{sizes[0]} and {sizes[1]}; use the task it was trained on (pendulum-swingup)."
+    )
+
+
+def test_an_environment_of_the_same_size_is_accepted(saved):
+    agent, _, _ = load_agent(saved[0], observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)
+    assert agent.world_model.observation_dim == OBSERVATION_DIM
+
+
+@pytest.mark.parametrize("change", [{"mlp_dim": 32}, {"latent_dim": 20}, {"layers": 3}])
+def test_weights_that_do_not_fit_their_configuration_are_refused(tmp_path, saved, change):
+    config = saved[2].to_dict()
+    path = edited(saved, tmp_path / "odd.pt", config={**config, "model": {**config["model"], **change}})
+    assert refusal(path, load_agent).startswith("does not fit its own configuration (")
+
+
+def test_compilation_can_be_overridden_on_loading(tmp_path, saved, monkeypatch):
+    path = edited(saved, tmp_path / "compiled.pt", config={**saved[2].to_dict(), "compile": "default"})
+    calls = []
+    monkeypatch.setattr(torch, "compile", lambda function, **options: calls.append(function) or function)
+    _, config, _ = load_agent(path, compile_setting="off")
+    assert config.compile == "off"
+    assert calls == []
+    _, config, _ = load_agent(path)
+    assert config.compile == "default"
+    assert calls != []

@@ -1,0 +1,420 @@
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+import yaml
+
+from torchrl_etdmpc.training import PRESETS, TrainConfig, preset
+from torchrl_etdmpc.training.config import (
+    LossConfig,
+    ModelConfig,
+    OptimConfig,
+    PlannerConfig,
+    ReanalyzeConfig,
+    ReplayConfig,
+)
+
+GROUPS = {
+    "model": ModelConfig,
+    "planner": PlannerConfig,
+    "reanalyze": ReanalyzeConfig,
+    "loss": LossConfig,
+    "optim": OptimConfig,
+    "replay": ReplayConfig,
+}
+
+# Thesis Table A.1, column EfficientTDMPC / UTD4, and the rest of the method from its text.
+UTD4 = {
+    "model.num_dynamics": 4,
+    "model.latent_dim": 512,
+    "model.mlp_dim": 512,
+    "model.encoder_dim": 256,
+    "model.encoder_layers": 1,  # hidden layers; the table counts the output layer too
+    "model.simnorm_dim": 8,
+    "model.num_values": 2,
+    "model.num_bins": 101,
+    "model.bin_min": -10.0,
+    "model.bin_max": 10.0,
+    "model.dropout": 0.01,
+    "model.log_std_min": -3.0,
+    "model.log_std_max": 1.0,
+    "model.activation": "mish",
+    "model.termination": False,
+    "planner.horizon": 6,
+    "planner.score": "mean",
+    "planner.beta": 0.0,
+    "planner.iterations": 6,
+    "planner.extra_iterations": 2,
+    "planner.large_action_dim": 20,
+    "planner.num_samples": 512,
+    "planner.num_elites": 64,
+    "planner.num_proposals": 24,
+    "planner.inverse_temperature": 0.5,
+    "planner.std_min": 0.05,
+    "planner.std_max": 2.0,
+    "planner.first_action": "elite",
+    "planner.eval_first_action": "best",
+    "reanalyze.horizon": 3,
+    "reanalyze.score": "final",
+    "reanalyze.beta": 0.0,  # on DMC
+    "reanalyze.iterations": 6,
+    "reanalyze.extra_iterations": 2,
+    "reanalyze.large_action_dim": 20,
+    "reanalyze.num_samples": 64,
+    "reanalyze.num_elites": 8,
+    "reanalyze.num_proposals": 3,
+    "reanalyze.inverse_temperature": 0.5,
+    "reanalyze.std_min": 0.05,
+    "reanalyze.std_max": 2.0,
+    "reanalyze.first_action": "elite",
+    "reanalyze.eval_first_action": "best",
+    "reanalyze.every": 2,
+    "reanalyze.num_slices": 20,
+    "reanalyze.proposal_log_std_min": -2.0,
+    "reanalyze.proposal_log_std_max": 1.0,
+    "loss.slice_len": 3,
+    "loss.rho": 0.5,
+    "loss.consistency_coef": 20.0,
+    "loss.reward_coef": 0.1,
+    "loss.value_coef": 0.1,
+    "loss.termination_coef": 1.0,
+    "loss.entropy_coef": 1e-4,
+    "loss.kl_direction": "backward",
+    "loss.tau": 0.01,
+    "loss.discount": None,  # from the episode's length
+    "optim.batch_size": 256,
+    "optim.updates_per_decision": 4,
+    "optim.lr": 3e-4,
+    "optim.encoder_lr_scale": 0.3,
+    "optim.grad_clip_norm": 20.0,
+    "replay.capacity": 1_000_000,
+    "replay.insertion": "step",
+    "replay.uniform_over": "episodes",
+    "replay.device": "cpu",
+    "replay.seed_decisions": None,  # max(1000, 5 episodes)
+    "replay.pretrain_updates": None,  # as many as seed decisions
+}
+
+# What the other rows of the table of presets change in it.
+CHANGES = {
+    "efficient-tdmpc": {"optim.updates_per_decision": 1, "reanalyze.every": 10},
+    "efficient-tdmpc-utd2": {"optim.updates_per_decision": 2, "reanalyze.every": 5},
+    "efficient-tdmpc-utd4": {},
+    "bmpc": {
+        "model.num_dynamics": 1,
+        "planner.horizon": 3,
+        "planner.score": "final",
+        "planner.eval_first_action": "elite",
+        "reanalyze.num_samples": 512,
+        "reanalyze.num_elites": 64,
+        "reanalyze.num_proposals": 24,
+        "optim.updates_per_decision": 1,
+        "reanalyze.every": 10,
+        "replay.insertion": "episode",
+    },
+}
+
+
+def method_settings(config: TrainConfig) -> dict[str, Any]:
+    """Every setting of the method (not of the run) by its dotted name."""
+    values = config.to_dict()
+    return {f"{group}.{name}": value for group in GROUPS for name, value in values[group].items()}
+
+
+def overrides(**settings: Any) -> dict[str, Any]:
+    """Nested settings from names in which ``__`` stands for the dot."""
+    values: dict[str, Any] = {}
+    for name, value in settings.items():
+        *group, last = name.split("__")
+        (values.setdefault(group[0], {}) if group else values)[last] = value
+    return values
+
+
+def refusal(**settings: Any) -> str:
+    """The message with which a configuration is refused."""
+    with pytest.raises(ValueError) as caught:
+        TrainConfig.from_dict(overrides(**settings))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_preset_is_the_paper_s_table_value_by_value(name):
+    assert method_settings(preset(name)) == UTD4 | CHANGES[name]
+
+
+def test_every_preset_is_known_by_its_own_name():
+    assert set(PRESETS) == {*CHANGES, "cpu"}
+    assert all(preset(name).preset == name for name in PRESETS)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_the_seed_phase_and_the_pretraining_are_five_episodes_on_dmc(name):
+    assert preset(name).seed_decisions == 2500
+    assert preset(name).pretrain_updates == 2500
+
+
+def test_the_pretraining_follows_the_seed_phase_unless_it_is_given():
+    assert TrainConfig.from_dict(overrides(replay__seed_decisions=700)).pretrain_updates == 700
+    both = TrainConfig.from_dict(overrides(replay__seed_decisions=700, replay__pretrain_updates=0))
+    assert (both.seed_decisions, both.pretrain_updates) == (700, 0)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_evaluations_are_ten_episodes_every_50000_env_steps(name):
+    assert (preset(name).eval_episodes, preset(name).eval_every) == (10, 50_000)
+
+
+def test_the_cpu_preset_shrinks_sizes_and_keeps_the_whole_method():
+    settings = method_settings(preset("cpu"))
+    sizes = {
+        *(f"model.{name}" for name in ("latent_dim", "mlp_dim", "encoder_dim", "num_dynamics", "activation")),
+        *(f"planner.{name}" for name in ("horizon", "num_samples", "num_elites", "num_proposals", "iterations")),
+        *(f"reanalyze.{name}" for name in ("num_samples", "num_elites", "num_proposals", "iterations", "num_slices")),
+        *("loss.tau", "optim.batch_size", "optim.lr", "replay.pretrain_updates"),
+    }
+    changed = {name for name, value in settings.items() if value != UTD4[name]}
+    assert changed - {"optim.updates_per_decision", "reanalyze.every"} <= sizes
+    assert settings["model.num_dynamics"] >= 2
+    assert settings["model.num_values"] >= 2
+    assert settings["planner.score"] == "mean"
+    assert settings["planner.horizon"] >= 2  # at 1 the mean over depths is no mean
+    assert settings["reanalyze.every"] >= 1
+    assert settings["replay.insertion"] == "step"
+
+
+def test_an_unknown_preset_is_refused_with_the_known_names():
+    with pytest.raises(ValueError) as caught:
+        preset("etdmpc")
+    assert str(caught.value) == f"unknown preset 'etdmpc'; choose one of {', '.join(PRESETS)}."
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_survives_the_round_trip_through_yaml(name):
+    config = dataclasses.replace(PRESETS[name], compile="off", run_dir="runs/a", threads=2)
+    assert TrainConfig.from_dict(config.to_dict()) == config
+    assert TrainConfig.from_dict(yaml.safe_load(yaml.safe_dump(config.to_dict()))) == config
+
+
+def test_missing_settings_take_their_default():
+    assert TrainConfig.from_dict({}) == TrainConfig()
+    assert TrainConfig.from_dict({"planner": {"horizon": 4}}).planner == PlannerConfig(horizon=4)
+
+
+def test_a_dictionary_is_not_changed_by_reading_it():
+    values = {"seed": 2.0, "planner": {"horizon": 4.0}}
+    TrainConfig.from_dict(values)
+    assert values == {"seed": 2.0, "planner": {"horizon": 4.0}}
+    assert isinstance(values["planner"]["horizon"], float)
+
+
+@pytest.mark.parametrize("cls", [TrainConfig, *GROUPS.values()])
+def test_no_setting_can_be_changed_afterwards(cls):
+    config = cls()
+    for field in dataclasses.fields(config):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(config, field.name, getattr(config, field.name))
+
+
+@pytest.mark.parametrize(
+    ("written", "name", "meant"),
+    [
+        ({"total_env_steps": 2e5}, "total_env_steps", 200_000),
+        ({"loss": {"discount": 1}}, "loss.discount", 1.0),
+        ({"loss": {"discount": None}}, "loss.discount", None),
+        ({"replay": {"seed_decisions": 3e3}}, "replay.seed_decisions", 3000),
+        ({"compile": False}, "compile", "off"),  # YAML reads a bare off as a boolean
+    ],
+)
+def test_a_number_or_switch_may_be_written_in_its_natural_way(written, name, meant):
+    config = TrainConfig.from_dict(written)
+    *group, last = name.split(".")
+    value = getattr(getattr(config, group[0]) if group else config, last)
+    assert value == meant
+    assert type(value) is type(meant)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seed": "one"}, "seed must be of type int, got 'one'."),
+        ({"seed": 1.5}, "seed must be of type int, got 1.5."),
+        ({"num_envs": True}, "num_envs must be of type int, got True."),
+        ({"eval_policy": 1}, "eval_policy must be of type bool, got 1."),
+        ({"task": None}, "task must be of type str, got None."),
+        ({"run_dir": 7}, "run_dir must be of type str, got 7."),
+        ({"resume": "auto"}, "resume must be of type bool, got 'auto'."),
+        ({"planner": 3}, "planner must be a group of settings, got 3."),
+        ({"optim__lr": "fast"}, "optim.lr must be of type float, got 'fast'."),
+        ({"optim__lr": True}, "optim.lr must be of type float, got True."),
+        ({"loss__discount": "high"}, "loss.discount must be of type float, got 'high'."),
+        ({"replay__seed_decisions": 1.5}, "replay.seed_decisions must be of type int, got 1.5."),
+        ({"model__termination": "yes"}, "model.termination must be of type bool, got 'yes'."),
+        ({"planner__horizon": [6]}, "planner.horizon must be of type int, got [6]."),
+    ],
+)
+def test_a_value_of_the_wrong_type_is_refused_by_the_setting_s_name(settings, message):
+    assert refusal(**settings) == message
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "known"),
+    [
+        ({"sede": 1}, "sede", "task, preset, seed"),
+        ({"planner__horizn": 3}, "planner.horizn", "horizon, num_samples"),
+        ({"reanalyze__interval": 3}, "reanalyze.interval", "every"),
+    ],
+)
+def test_an_unknown_setting_is_refused_with_the_known_ones(settings, name, known):
+    message = refusal(**settings)
+    assert message.startswith(f"unknown setting {name}; known: ")
+    assert known in message
+    assert "\n" not in message
+
+
+REFUSED = [
+    # sizes of the networks
+    ({"model__latent_dim": 20}, "model.latent_dim must be a multiple of model.simnorm_dim=8, got 20."),
+    ({"model__simnorm_dim": 7}, "model.latent_dim must be a multiple of model.simnorm_dim=7, got 512."),
+    *(
+        ({f"model__{name}": 0}, f"model.{name} must be at least 1, got 0.")
+        for name in (
+            "latent_dim",
+            "mlp_dim",
+            "encoder_dim",
+            "encoder_layers",
+            "num_dynamics",
+            "num_values",
+            "simnorm_dim",
+        )
+    ),
+    ({"model__num_bins": 1}, "model.num_bins must be at least 2, got 1."),
+    ({"model__bin_min": 10.0}, "model.bin_min must be below model.bin_max."),
+    ({"model__log_std_min": 1.0}, "model.log_std_min must be below model.log_std_max."),
+    ({"model__dropout": 1.0}, "model.dropout must be in [0, 1), got 1.0."),
+    ({"model__activation": "tanh"}, "model.activation must be one of mish, silu, relu, got 'tanh'."),
+    # both planners
+    ({"planner__num_elites": 600}, "planner.num_elites must be at most planner.num_samples=512, got 600."),
+    ({"reanalyze__num_elites": 65}, "reanalyze.num_elites must be at most reanalyze.num_samples=64, got 65."),
+    *(
+        ({f"{group}__{name}": 0}, f"{group}.{name} must be at least 1, got 0.")
+        for group in ("planner", "reanalyze")
+        for name in ("horizon", "iterations", "num_elites")
+    ),
+    ({"planner__num_proposals": 512}, "planner.num_proposals must be in [0, 512), got 512."),
+    ({"reanalyze__num_proposals": -1}, "reanalyze.num_proposals must be in [0, 64), got -1."),
+    ({"planner__extra_iterations": -1}, "planner.extra_iterations must not be negative, got -1."),
+    ({"planner__inverse_temperature": -0.5}, "planner.inverse_temperature must not be negative, got -0.5."),
+    ({"planner__std_min": 0.0}, "planner.std_min must be in (0, planner.std_max=2.0], got 0.0."),
+    ({"reanalyze__std_min": 3.0}, "reanalyze.std_min must be in (0, reanalyze.std_max=2.0], got 3.0."),
+    ({"planner__score": "median"}, "planner.score must be one of final, mean, adaptive, got 'median'."),
+    (
+        {"planner__score": "adaptive", "planner__beta": -1.0},
+        "planner.beta must not be negative with planner.score=adaptive, got -1.0.",
+    ),
+    ({"planner__first_action": "worst"}, "planner.first_action must be one of elite, mean, best, got 'worst'."),
+    (
+        {"reanalyze__eval_first_action": "any"},
+        "reanalyze.eval_first_action must be one of elite, mean, best, got 'any'.",
+    ),
+    ({"reanalyze__every": -1}, "reanalyze.every must not be negative, got -1; 0 turns reanalyze off."),
+    ({"reanalyze__num_slices": 0}, "reanalyze.num_slices must be at least 1, got 0."),
+    (
+        {"reanalyze__proposal_log_std_min": 2.0},
+        "reanalyze.proposal_log_std_min must be below reanalyze.proposal_log_std_max.",
+    ),
+    # learning
+    ({"loss__slice_len": 0}, "loss.slice_len must be at least 1, got 0."),
+    ({"loss__slice_len": 501}, "loss.slice_len must fit into an episode of 500 decisions, got 501."),
+    ({"loss__rho": 0.0}, "loss.rho must be in (0, 1], got 0.0."),
+    ({"loss__tau": 1.5}, "loss.tau must be in [0, 1], got 1.5."),
+    ({"loss__discount": 1.01}, "loss.discount must be in (0, 1], got 1.01."),
+    ({"loss__discount": 0.0}, "loss.discount must be in (0, 1], got 0.0."),
+    ({"loss__kl_direction": "both"}, "loss.kl_direction must be one of backward, forward, got 'both'."),
+    ({"optim__batch_size": 0}, "optim.batch_size must be at least 1, got 0."),
+    ({"optim__updates_per_decision": 0}, "optim.updates_per_decision must be at least 1, got 0."),
+    ({"optim__lr": 0.0}, "optim.lr must be positive, got 0.0."),
+    ({"optim__lr": float("nan")}, "optim.lr must be positive, got nan."),
+    ({"optim__grad_clip_norm": 0.0}, "optim.grad_clip_norm must be positive, got 0.0."),
+    ({"optim__encoder_lr_scale": -0.3}, "optim.encoder_lr_scale must not be negative, got -0.3."),
+    # data
+    ({"replay__capacity": 0}, "replay.capacity must be at least 1, got 0."),
+    ({"replay__capacity": 5}, "replay.capacity must be at least 6 with these settings, got 5."),
+    ({"replay__capacity": 11, "num_envs": 2}, "replay.capacity must be at least 12 with these settings, got 11."),
+    (
+        {"replay__capacity": 499, "replay__insertion": "episode"},
+        "replay.capacity must be at least 500 with these settings, got 499.",
+    ),
+    ({"replay__insertion": "batch"}, "replay.insertion must be one of step, episode, got 'batch'."),
+    ({"replay__uniform_over": "rows"}, "replay.uniform_over must be one of episodes, starts, got 'rows'."),
+    ({"replay__device": "cuda"}, "replay.device must be one of cpu, run, got 'cuda'."),
+    ({"replay__pretrain_updates": -1}, "replay.pretrain_updates must not be negative, got -1."),
+    (
+        {"replay__seed_decisions": 5, "num_envs": 2},
+        "replay.seed_decisions must be at least loss.slice_len * num_envs=6, got 5.",
+    ),
+    (
+        {"replay__seed_decisions": 999, "replay__insertion": "episode", "num_envs": 2},
+        "replay.seed_decisions must cover an episode of every environment (1000 decisions) with "
+        "replay.insertion=episode, got 999.",
+    ),
+    # the run
+    (
+        {"total_env_steps": 5000},
+        "total_env_steps must exceed the seed phase of 5000 env steps, got 5000; raise the budget or lower "
+        "replay.seed_decisions.",
+    ),
+    *(
+        ({name: 0}, f"{name} must be at least 1, got 0.")
+        for name in ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every", "threads")
+    ),
+    ({"device": "tpu"}, "device must be one of auto, cpu, cuda, got 'tpu'."),
+    ({"compile": "max"}, "compile must be one of auto, off, default, got 'max'."),
+    ({"logger": "mlflow"}, "logger must be one of none, tensorboard, wandb, got 'mlflow'."),
+]
+
+
+@pytest.mark.parametrize(("settings", "message"), REFUSED, ids=[", ".join(settings) for settings, _ in REFUSED])
+def test_an_impossible_setting_is_refused_in_one_line_that_names_it(settings, message):
+    assert refusal(**settings) == message
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"planner__num_elites": 512, "planner__num_proposals": 0},
+        {"model__latent_dim": 24, "model__simnorm_dim": 24},
+        {"planner__std_min": 2.0},
+        {"planner__beta": -1.0},  # optimism
+        {"reanalyze__every": 0},
+        {"loss__slice_len": 500},
+        {"total_env_steps": 5001},
+        {"replay__capacity": 6},
+        {"replay__seed_decisions": 3},
+        {"replay__seed_decisions": 500, "replay__insertion": "episode", "replay__capacity": 500},
+        {"device": "cuda:1"},
+    ],
+)
+def test_the_last_possible_value_is_accepted(settings):
+    config = TrainConfig.from_dict(overrides(**settings)).to_dict()
+    for name, value in settings.items():
+        *group, last = name.split("__")
+        assert (config[group[0]] if group else config)[last] == value
+
+
+def test_resume_says_what_to_do_instead():
+    assert refusal(resume=True).startswith("resume is not implemented yet; start a new run_dir")
+
+
+def test_an_unknown_task_is_refused_with_the_nearest_names():
+    message = refusal(task="walker-wlak")
+    assert message.startswith("unknown task 'walker-wlak'; did you mean walker-walk,")
+    assert "\n" not in message
+
+
+def test_a_configuration_cannot_be_made_impossible_by_replacing_a_value():
+    with pytest.raises(ValueError, match=r"^planner\.num_elites must be at most"):
+        dataclasses.replace(preset("cpu").planner, num_elites=49)
+    with pytest.raises(ValueError, match="^total_env_steps must exceed the seed phase"):
+        dataclasses.replace(preset("cpu"), total_env_steps=1000)

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, ExplorationType, SerialEnv, StepCounter
+from torchrl.envs.utils import exploration_type, set_exploration_type
+
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel
+from torchrl_etdmpc.testing import LineWorld
+from torchrl_etdmpc.training import BarePolicy, evaluate
+
+
+class CountingEnv(EnvBase):
+    """Counts its steps. Step t = 1, 2, .. earns t plus the action; the episode ends after ``length`` steps."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__()
+        self.length = length
+        self.steps = 0
+        self.resets = 0
+        self.observation_spec = Composite(observation=Unbounded((1,)))
+        self.action_spec = Bounded(-1, 1, (1,))
+        self.reward_spec = Unbounded((1,))
+        self.done_spec = Composite(done=Binary(1, dtype=torch.bool), terminated=Binary(1, dtype=torch.bool))
+
+    def _reset(self, tensordict: TensorDictBase | None) -> TensorDict:
+        self.steps = 0
+        self.resets += 1
+        return TensorDict({"observation": torch.zeros(1)})
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.steps += 1
+        done = torch.tensor([self.steps >= self.length])
+        return TensorDict(
+            {
+                "observation": torch.tensor([float(self.steps)]),
+                "reward": self.steps + tensordict["action"],
+                "done": done,
+                "terminated": done.clone(),
+            }
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+class ConstantPolicy(TensorDictModuleBase):
+    """Always the same action; notes how it was called."""
+
+    in_keys = ["observation"]
+    out_keys = ["action"]
+
+    def __init__(self, action: float = 0.5) -> None:
+        super().__init__()
+        self.action = action
+        self.exploration_types: list[ExplorationType | None] = []
+        self.gradients: list[bool] = []
+        self.inputs: list[set] = []
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.exploration_types.append(exploration_type())
+        self.gradients.append(torch.is_grad_enabled())
+        self.inputs.append(set(tensordict.keys(True, True)))
+        return tensordict.set("action", torch.full_like(tensordict["observation"], self.action))
+
+
+def side_by_side(*lengths: int) -> SerialEnv:
+    return SerialEnv(len(lengths), [partial(CountingEnv, length) for length in lengths])
+
+
+def expected_return(length: int, action: float = 0.5) -> float:
+    return length * (length + 1) / 2 + length * action
+
+
+def test_a_return_is_the_sum_of_an_episode_s_rewards():
+    assert evaluate(CountingEnv(4), ConstantPolicy(), episodes=1).tolist() == [expected_return(4)]
+
+
+def test_a_return_equals_that_of_an_independent_rollout():
+    pytest.importorskip("dm_control")
+    from torchrl_etdmpc.envs import make_dmc_env
+
+    torch.manual_seed(0)
+    policy = BarePolicy(WorldModel(5, 1, latent_dim=16, mlp_dim=16))
+    env, other = (make_dmc_env("cartpole-balance", seed=3).append_transform(StepCounter(25)) for _ in range(2))
+    rollout = other.rollout(100, policy)
+    assert rollout.shape == (25,)
+    returns = evaluate(env, policy, episodes=1)
+    torch.testing.assert_close(returns, rollout["next", "reward"].sum().reshape(1))
+    assert returns.item() > 1
+
+
+def test_several_episodes_of_one_environment_are_counted_apart():
+    env = CountingEnv(3)
+    assert evaluate(env, ConstantPolicy(), episodes=4).tolist() == [expected_return(3)] * 4
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 3, 4])
+def test_a_batch_of_environments_gives_as_many_returns_as_asked_for(episodes):
+    single = evaluate(CountingEnv(3), ConstantPolicy(), episodes=episodes)
+    batched = evaluate(side_by_side(3, 3), ConstantPolicy(), episodes=episodes)
+    assert batched.shape == (episodes,)
+    assert torch.equal(batched, single)
+
+
+@pytest.mark.parametrize("policy_device", [None, "cpu"])
+def test_only_the_first_episode_counts_where_episodes_end_at_different_times(policy_device):
+    returns = evaluate(side_by_side(2, 7, 3), ConstantPolicy(), episodes=3, policy_device=policy_device)
+    assert returns.tolist() == [expected_return(2), expected_return(7), expected_return(3)]
+
+
+def test_a_round_lasts_as_long_as_its_longest_episode():
+    steps: list[Tensor] = []
+    env = side_by_side(2, 5)
+    evaluate(env, ConstantPolicy(), episodes=3, on_step=lambda step: steps.append(step["next", "reward"].clone()))
+    assert len(steps) == 2 * 5
+    assert [step[1].item() for step in steps] == [1.5, 2.5, 3.5, 4.5, 5.5] * 2
+
+
+@pytest.mark.parametrize("policy_device", [None, "cpu"])
+def test_the_policy_acts_without_exploration_and_without_gradients(policy_device):
+    policy = ConstantPolicy()
+    with set_exploration_type(ExplorationType.RANDOM), torch.enable_grad():
+        evaluate(CountingEnv(3), policy, episodes=2, policy_device=policy_device)
+        assert exploration_type() is ExplorationType.RANDOM
+    assert set(policy.exploration_types) == {ExplorationType.DETERMINISTIC}
+    assert not any(policy.gradients)
+
+
+def test_on_another_device_the_policy_is_given_what_it_reads_and_no_more():
+    policy = ConstantPolicy()
+    returns = evaluate(CountingEnv(3), policy, episodes=1, policy_device="cpu")
+    assert returns.tolist() == [expected_return(3)]
+    assert policy.inputs == [{"observation"}] * 3
+
+
+@pytest.mark.parametrize("episodes", [0, -1])
+def test_less_than_one_episode_is_refused(episodes):
+    env = CountingEnv(3)
+    with pytest.raises(ValueError) as caught:
+        evaluate(env, ConstantPolicy(), episodes=episodes)
+    assert str(caught.value) == f"episodes must be at least 1, got {episodes}."
+    assert env.resets == 0
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_the_warm_start_is_carried_through_a_round_and_reset_between_rounds(batched):
+    torch.manual_seed(0)
+    planner = EnsembleMPPIPlanner(
+        LatentEnv(LineWorld()), horizon=3, num_samples=16, num_elites=4, num_proposals=2, iterations=2
+    )
+    carried: list[Tensor] = []
+    plan = planner.plan
+
+    def record(observation: Tensor, plan_mean: Tensor, **options):
+        carried.append(plan_mean.clone())
+        return plan(observation, plan_mean, **options)
+
+    planner.plan = record
+    env = side_by_side(4, 4) if batched else CountingEnv(4)
+    env = env.append_transform(planner.make_tensordict_primer())
+    evaluate(env, planner, episodes=4 if batched else 2)
+    assert len(carried) == 8
+    assert [bool(plan_mean.any()) for plan_mean in carried] == [False, True, True, True] * 2
+
+
+def test_the_bare_policy_acts_with_the_mean_whatever_the_exploration():
+    torch.manual_seed(0)
+    world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
+    observation = torch.randn(5, 3)
+    mean, log_std = world_model.policy(world_model.encode(observation))
+    assert (log_std > -3).all()  # or a sample would be close to the mean by chance
+    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        with set_exploration_type(kind):
+            out = BarePolicy(world_model)(TensorDict({"observation": observation}, [5]))
+        assert torch.equal(out["action"], mean)
+        assert not out["action"].requires_grad
+        assert set(out.keys()) == {"observation", "action"}

@@ -1,0 +1,352 @@
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+import yaml
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, StepCounter, Transform
+
+pytest.importorskip("dm_control")
+
+from torchrl_etdmpc.collectors import NonFiniteError  # noqa: E402
+from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.training import (  # noqa: E402
+    RunLog,
+    TrainConfig,
+    TrainingRun,
+    build_agent,
+    build_collector,
+    build_reanalyze,
+    build_replay,
+    load_agent,
+    preset,
+)
+
+EPISODE = 20  # decisions; the suite's own 500 would cost more than they show
+
+
+def tiny_config(**changes: Any) -> TrainConfig:
+    """Half a minute of a run in half a second; a group is changed by a dictionary."""
+    values: dict[str, Any] = {
+        "task": "cartpole-balance",
+        "preset": "cpu",
+        "total_env_steps": 160,
+        "compile": "off",
+        "eval_every": 80,
+        "eval_episodes": 1,
+        "checkpoint_every": 80,
+        "log_every": 2 * EPISODE,
+        "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+        "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+        "reanalyze": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 1},
+        "optim": {"batch_size": 4, "updates_per_decision": 2},
+        "replay": {"seed_decisions": 30, "pretrain_updates": 7},
+    }
+    values["reanalyze"] |= {"every": 3, "num_slices": 2}
+    for name, change in changes.items():
+        values[name] = {**values.get(name, {}), **change} if isinstance(change, dict) else change
+    return TrainConfig.from_dict(values)
+
+
+def make_env(config: TrainConfig, *transforms: Transform, num_envs: int = 1, seed: int = 0) -> EnvBase:
+    env = make_dmc_env(config.task, seed=seed, num_envs=num_envs, parallel=False)
+    for transform in (StepCounter(EPISODE), *transforms):
+        env = env.append_transform(transform)
+    return env
+
+
+def make_run(config: TrainConfig, run_dir: Path, *transforms: Transform) -> TrainingRun:
+    torch.manual_seed(0)
+    log = RunLog.create(run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps)
+    env = make_env(config, *transforms, num_envs=config.num_envs)
+    eval_env = make_env(config, num_envs=config.eval_episodes, seed=1)
+    return TrainingRun(config, env=env, eval_env=eval_env, log=log)
+
+
+def read_table(path: Path) -> list[dict[str, float]]:
+    with path.open(newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+class Finished(NamedTuple):
+    config: TrainConfig
+    run: TrainingRun
+    summary: dict[str, Any]
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A whole run: 30 seed decisions, 7 updates before and 2 per decision afterwards, 80 decisions in all."""
+    config = tiny_config(eval_policy=True)
+    path = tmp_path_factory.mktemp("runs") / "cartpole"
+    run = make_run(config, path)
+    return Finished(config, run, run.run(), path)
+
+
+def test_a_run_directory_holds_what_it_should_and_nothing_else(finished):
+    files = {str(path.relative_to(finished.path)) for path in finished.path.rglob("*") if path.is_file()}
+    expected = {"config.yaml", "train.csv", "eval.csv", "summary.json", "curve.png"}
+    assert files == expected | {str(Path("checkpoints", "last.pt"))}
+
+
+def test_the_configuration_can_be_read_back(finished):
+    values = yaml.safe_load((finished.path / "config.yaml").read_text())
+    assert TrainConfig.from_dict(values) == finished.config
+
+
+def test_evaluations_are_at_the_start_at_every_interval_and_at_the_end(finished):
+    rows = read_table(finished.path / "eval.csv")
+    header = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes"
+    assert (finished.path / "eval.csv").read_text().splitlines()[0] == header
+    assert [row["env_steps"] for row in rows] == [0, 80, 160]
+    assert all(row["episodes"] == 1 and row["return_std"] == 0 for row in rows)
+    assert all(0 < row["return_mean"] <= 2 * EPISODE for row in rows)
+
+
+def test_a_training_row_is_written_at_every_interval_after_the_seed_phase(finished):
+    rows = read_table(finished.path / "train.csv")
+    assert [row["env_steps"] for row in rows] == [80, 120, 160]
+
+
+@pytest.mark.parametrize("name", ["train.csv", "eval.csv"])
+def test_the_counters_agree_with_each_other_in_every_row(finished, name):
+    rows = read_table(finished.path / name)
+    assert list(rows[0])[:4] == ["env_steps", "decision_steps", "updates", "wall_time_s"]
+    for row in rows:
+        assert row["decision_steps"] == row["env_steps"] / 2
+        learning = row["decision_steps"] - 30
+        assert row["updates"] == (7 + 2 * learning if learning > 0 else 0)
+    times = [row["wall_time_s"] for row in rows]
+    assert times == sorted(times)
+
+
+def test_every_training_metric_is_there_and_finite(finished):
+    rows = read_table(finished.path / "train.csv")
+    names = {f"loss_{name}" for name in ("consistency", "reward", "value", "policy")}
+    names |= {"grad_norm_model", "grad_norm_policy", "policy_kl", "kl_scale", "value_target", "policy_return"}
+    names |= {"episode_return", "targets_refreshed", "targets_stale", "target_age"}
+    assert names <= set(rows[0])
+    for row in rows:
+        assert [name for name, value in row.items() if not math.isfinite(value)] == []
+    assert rows[-1]["targets_refreshed"] > rows[0]["targets_refreshed"] > 0
+    assert rows[-1]["targets_stale"] == 0
+
+
+def test_the_training_return_is_that_of_the_episodes_since_the_last_row(finished):
+    # A row is written where an episode ends. The first one follows two episodes.
+    rewards = finished.run.replay[:]["next", "reward"].reshape(-1, EPISODE).sum(-1)
+    assert len(rewards) == 4
+    expected = [rewards[:2].mean().item(), rewards[2].item(), rewards[3].item()]
+    assert [row["episode_return"] for row in read_table(finished.path / "train.csv")] == pytest.approx(expected)
+
+
+def test_the_summary_states_the_run_and_its_result(finished):
+    summary = json.loads((finished.path / "summary.json").read_text())
+    evaluations = [row["return_mean"] for row in read_table(finished.path / "eval.csv")]
+    assert (summary["task"], summary["preset"], summary["seed"]) == ("cartpole-balance", "cpu", 1)
+    assert summary["env_steps"] == 160
+    assert summary["final_return"] == evaluations[-1]
+    assert summary["best_return"] == max(evaluations)
+    assert summary["wall_time_s"] > 0
+    assert summary["decisions_per_second"] > 0
+    assert summary["parameters"] == sum(p.numel() for p in finished.run.agent.world_model.parameters())
+    assert summary["device"] == "cpu"
+    assert {"python", "torch", "torchrl", "tensordict"} <= set(summary["versions"])
+    assert {name: summary[name] for name in finished.summary} == finished.summary
+
+
+def test_the_checkpoint_is_the_agent_at_the_end(finished):
+    agent, config, counters = load_agent(finished.path / "checkpoints" / "last.pt", observation_dim=5, action_dim=1)
+    assert config == finished.config
+    assert (counters["env_steps"], counters["decision_steps"], counters["updates"]) == (160, 80, 107)
+    final = finished.run.agent.loss.state_dict()
+    assert all(torch.equal(value, final[name]) for name, value in agent.loss.state_dict().items())
+
+
+def test_the_environments_are_closed_at_the_end(finished):
+    assert finished.run.collector.env.is_closed
+    assert finished.run.eval_env.is_closed
+
+
+def test_every_decision_after_the_seed_phase_is_stored_with_a_planner_s_target(finished):
+    rows = finished.run.replay[:]
+    assert len(rows) == 80
+    assert (rows["plan", "scale"][30:] != 1).all()
+    assert set(rows["collector", "traj_ids"].tolist()) == {0, 1, 2, 3}
+    assert not {"plan_mean", "is_init", "episode_reward"} & set(rows.keys())
+
+
+def test_two_environments_keep_the_ratio_of_updates_to_decisions(tmp_path):
+    # 31 seed decisions need 16 steps of two environments.
+    config = tiny_config(num_envs=2, replay={"seed_decisions": 31}, total_env_steps=122, eval_every=1000)
+    run = make_run(config, tmp_path)
+    summary = run.run()
+    decisions = run.collector.frames
+    assert summary["env_steps"] == 2 * decisions == 124  # the first multiple of a step of both that reaches the budget
+    assert run.agent.updater.updates == 7 + 2 * (decisions - 32)
+    assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 124]
+    trajectories = run.replay[:]["collector", "traj_ids"]
+    assert (trajectories[0::2] % 2 == 0).all()
+    assert (trajectories[:40:2] == 0).all()
+    assert (trajectories[1:40:2] == 1).all()
+
+
+def test_a_transition_can_be_sampled_before_the_next_decision(tmp_path):
+    run = make_run(tiny_config(), tmp_path)
+    for number in range(1, 2 * EPISODE):
+        run.step()
+        assert len(run.replay) == number
+
+
+def test_with_insertion_by_episode_only_whole_episodes_are_in_the_buffer(tmp_path):
+    config = tiny_config(
+        total_env_steps=1100, replay={"insertion": "episode", "seed_decisions": 500, "pretrain_updates": 1}
+    )
+    run = make_run(config, tmp_path)
+    for number in range(1, 3 * EPISODE):
+        run.step()
+        assert len(run.replay) == number // EPISODE * EPISODE
+    run.pretrain()
+    run.update()
+    assert run.agent.updater.updates == 2
+
+
+def test_pretraining_neither_distils_nor_reanalyzes(tmp_path):
+    run = make_run(tiny_config(reanalyze={"every": 1}), tmp_path)
+    for _ in range(30):
+        run.step()
+    policy = {name: value.clone() for name, value in run.agent.world_model.policy.state_dict().items()}
+    encoder = run.agent.world_model.encoder.output.weight.clone()
+    run.pretrain()
+    assert run.agent.updater.updates == 7
+    assert (run.reanalyze.samples, run.reanalyze.refreshed) == (0, 0)
+    assert not torch.equal(run.agent.world_model.encoder.output.weight, encoder)
+    assert all(torch.equal(value, policy[name]) for name, value in run.agent.world_model.policy.state_dict().items())
+    run.update()
+    assert run.reanalyze.refreshed == 0  # every decision is every second update
+    run.update()
+    assert run.reanalyze.refreshed > 0
+    assert not torch.equal(run.agent.world_model.policy.output.weight, policy["output.weight"])
+
+
+def test_a_run_without_reanalyze_has_no_metrics_of_it(tmp_path):
+    config = tiny_config(total_env_steps=70, log_every=5, eval_every=1000, reanalyze={"every": 0})
+    run = make_run(config, tmp_path)
+    run.run()
+    assert run.reanalyze is None
+    assert not [name for name in read_table(tmp_path / "train.csv")[0] if name.startswith("target")]
+
+
+def test_the_return_of_no_finished_episode_is_not_a_number(tmp_path):
+    config = tiny_config(total_env_steps=70, log_every=4, eval_every=1000)
+    make_run(config, tmp_path).run()
+    rows = read_table(tmp_path / "train.csv")
+    assert [row["env_steps"] for row in rows] == [64, 68, 70]
+    # The first row gets the episode that ended in the seed phase.
+    assert [math.isnan(row["episode_return"]) for row in rows] == [False, True, True]
+
+
+class BreakingReward(Transform):
+    """The reward is not a number any more after so many steps."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        self.steps = steps
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.steps -= 1
+        if self.steps < 0:
+            next_tensordict["reward"] = torch.full_like(next_tensordict["reward"], torch.nan)
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return tensordict_reset
+
+
+@pytest.mark.parametrize(("steps", "updates"), [(10, 0), (33, 7 + 2 * 3)], ids=["while seeding", "while learning"])
+def test_a_broken_environment_stops_the_run_after_its_agent_was_saved(tmp_path, steps, updates):
+    run = make_run(tiny_config(), tmp_path, BreakingReward(steps))
+    with pytest.raises(NonFiniteError, match=rf"reward.* at decision step {steps} ") as caught:
+        run.run()
+    assert "\n" not in str(caught.value)
+    agent, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
+    assert (counters["decision_steps"], counters["updates"]) == (steps, updates)
+    assert agent.updater.updates == updates
+    assert len(run.replay) == steps
+    assert not (tmp_path / "summary.json").exists()
+    assert run.collector.env.is_closed
+    assert run.eval_env.is_closed
+
+
+def test_any_other_error_closes_the_environments_too(tmp_path, monkeypatch):
+    run = make_run(tiny_config(), tmp_path)
+
+    def fail() -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(run, "pretrain", fail)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        run.run()
+    assert run.collector.env.is_closed
+    assert run.eval_env.is_closed
+    assert not (tmp_path / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "sizes", "iterations"),
+    [("walker-walk", (24, 6), 2), ("quadruped-run", (78, 12), 2), ("humanoid-run", (67, 21), 4)],
+)
+def test_the_paper_s_method_runs_on_a_real_task(task, sizes, iterations):
+    base = preset("efficient-tdmpc-utd4")
+    small = {"num_samples": 16, "num_elites": 4, "num_proposals": 4, "iterations": 2}
+    config = dataclasses.replace(
+        base,
+        task=task,
+        compile="off",
+        total_env_steps=100,
+        model=dataclasses.replace(base.model, latent_dim=32, mlp_dim=32, encoder_dim=32),
+        planner=dataclasses.replace(base.planner, **small),
+        reanalyze=dataclasses.replace(base.reanalyze, **small, num_slices=4),
+        optim=dataclasses.replace(base.optim, batch_size=8),
+        replay=dataclasses.replace(base.replay, seed_decisions=12),
+    )
+    torch.manual_seed(0)
+    env = make_dmc_env(task, seed=0)
+    assert (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]) == sizes
+    agent, replay = build_agent(config, *sizes), build_replay(config)
+    assert agent.planner.iterations == agent.reanalyze_planner.iterations == iterations
+    reanalyze = build_reanalyze(config, agent, replay)
+    collector = build_collector(config, agent, env, replay)
+
+    def update(*, distill: bool = True) -> TensorDict:
+        return agent.updater.step(replay.sample().reshape(-1, config.loss.slice_len), distill=distill)
+
+    for _ in range(12):
+        collector.step()
+    reanalyze.enabled = False
+    update(distill=False)
+    reanalyze.enabled = True
+    for _ in range(4):
+        row = collector.step()
+        assert (row["action"].abs() <= 1).all()
+        assert not row["plan", "fallback"].any()
+        for _ in range(4):
+            metrics = update()
+            assert all(value.isfinite() for value in metrics.values()), metrics
+    collector.shutdown()
+    assert agent.updater.updates == 17
+    assert reanalyze.refreshed > 0  # 16 samples, every 8th
+    assert reanalyze.stale == 0
+    rows = replay[:]
+    assert len(rows) == 16
+    assert (rows["plan", "version"][12:] > 0).all()
+    assert (rows["plan", "scale"][12:] != 1).all()
+    assert all(parameter.isfinite().all() for parameter in agent.world_model.parameters())

@@ -1,0 +1,342 @@
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Iterator
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+
+from torchrl_etdmpc.functional import updated_scale
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+from torchrl_etdmpc.testing import random_slices
+from torchrl_etdmpc.training import Updater
+
+OBSERVATION_DIM, ACTION_DIM = 5, 3
+LR, TAU, CLIP = 1e-3, 0.05, 20.0
+
+
+@pytest.fixture(autouse=True)
+def _double_precision() -> Iterator[None]:
+    """Two ways to the same number agree to many digits."""
+    torch.manual_seed(0)
+    previous = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(previous)
+
+
+def make_world_model(**options) -> WorldModel:
+    """Small networks with no zero layer, so that every gradient flows from the first update on."""
+    sizes = {"latent_dim": 16, "mlp_dim": 12, "encoder_dim": 10, "num_dynamics": 2, "simnorm_dim": 4, "num_bins": 21}
+    world_model = WorldModel(OBSERVATION_DIM, ACTION_DIM, **(sizes | options))
+    with torch.no_grad():
+        for parameter in world_model.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    return world_model
+
+
+def make_updater(world_model: WorldModel | None = None, *, tau: float = TAU, lr: float = LR, **options) -> Updater:
+    world_model = make_world_model() if world_model is None else world_model
+    loss = EfficientTDMPCLoss(world_model, discount=0.9, scale_tau=tau, **options)
+    return Updater(loss, lr=lr, grad_clip_norm=CLIP, tau=tau)
+
+
+def make_batch(num_slices: int = 8) -> TensorDict:
+    """Slices whose planner targets are sharp, so that the KL spreads by more than the running scale's floor of 1."""
+    batch = random_slices(OBSERVATION_DIM, ACTION_DIM, num_slices=num_slices, terminated=True)
+    batch["plan", "scale"] = 0.05 * batch["plan", "scale"]
+    return batch
+
+
+def seeded_step(updater: Updater, batch: TensorDict, *, seed: int = 7, distill: bool = True) -> TensorDict:
+    torch.manual_seed(seed)
+    return updater.step(batch, distill=distill)
+
+
+def snapshot(updater: Updater) -> dict[str, Tensor]:
+    """Copies of all weights, target weights and buffers."""
+    state = {f"loss.{name}": value.clone() for name, value in updater.loss.state_dict().items()}
+    world_model = updater.loss.world_model.state_dict()
+    return state | {f"world_model.{name}": value.clone() for name, value in world_model.items()}
+
+
+def targets_and_values(updater: Updater) -> list[tuple[Tensor, Tensor]]:
+    """Each target weight of the value heads beside the weight that it follows."""
+    targets = updater.loss.target_value_params.flatten_keys(".").items()
+    values = dict(updater.loss.world_model.value_head.named_parameters())
+    return [(target, values[name]) for name, target in targets]
+
+
+def applied_gradients(updater: Updater) -> dict[str, list[list[Tensor]]]:
+    """Fills up with the gradients that each optimiser is handed at every update."""
+    recorded: dict[str, list[list[Tensor]]] = {"model": [], "policy": []}
+    for name, optimizer in (("model", updater.model_optimizer), ("policy", updater.policy_optimizer)):
+
+        def record(optimizer, args, kwargs, name=name):
+            groups = optimizer.param_groups
+            recorded[name].append([p.grad.clone() for group in groups for p in group["params"]])
+
+        optimizer.register_step_pre_hook(record)
+    return recorded
+
+
+def norm(gradients: list[Tensor]) -> Tensor:
+    return torch.cat([gradient.flatten() for gradient in gradients]).norm()
+
+
+@pytest.mark.parametrize("termination", [False, True])
+def test_one_update_changes_every_weight(termination):
+    updater = make_updater(make_world_model(termination=termination))
+    before = snapshot(updater)
+    seeded_step(updater, make_batch())
+    for name, parameter in updater.loss.world_model.named_parameters():
+        assert not torch.equal(parameter, before[f"world_model.{name}"]), name
+
+
+def test_the_planner_s_world_model_and_the_loss_stay_one_set_of_weights():
+    updater = make_updater()
+    seeded_step(updater, make_batch())
+    online = {p.data_ptr() for p in updater.loss.world_model.parameters()}
+    assert online == {p.data_ptr() for p in [*updater.model_parameters, *updater.policy_parameters]}
+
+
+def test_the_two_optimisers_share_the_weights_out_between_them():
+    updater = make_updater(make_world_model(termination=True))
+    model = {id(p) for p in updater.model_parameters}
+    policy = {id(p) for p in updater.policy_parameters}
+    assert not model & policy
+    assert model | policy == {id(p) for p in updater.loss.world_model.parameters()}
+    assert policy == {id(p) for p in updater.loss.world_model.policy.parameters()}
+
+
+def test_each_update_counts_as_one_version_whether_it_distils_or_not():
+    updater = make_updater()
+    assert updater.updates == 0
+    for number, distill in enumerate((False, True, True), start=1):
+        seeded_step(updater, make_batch(), distill=distill)
+        assert updater.updates == int(updater.loss.world_model.version) == number
+
+
+def test_the_targets_move_by_tau_towards_the_new_values_after_each_update():
+    updater = make_updater()
+    for _ in range(3):
+        before = [target.clone() for target, _ in targets_and_values(updater)]
+        seeded_step(updater, make_batch())
+        for old, (target, value) in zip(before, targets_and_values(updater), strict=True):
+            torch.testing.assert_close(target, (1 - TAU) * old + TAU * value, rtol=1e-12, atol=1e-14)
+            assert not torch.equal(target, old)
+
+
+def test_the_returned_numbers_are_detached_finite_scalars():
+    out = seeded_step(make_updater(), make_batch())
+    assert {"loss_consistency", "loss_reward", "loss_value", "loss_policy"} <= set(out.keys())
+    assert {"grad_norm_model", "grad_norm_policy", "kl_scale"} <= set(out.keys())
+    for name, value in out.items():
+        assert value.shape == (), name
+        assert not value.requires_grad, name
+        assert value.isfinite(), name
+
+
+@pytest.mark.parametrize(
+    ("huge", "clipped"),
+    [
+        ({"consistency_coef": 1e8}, {"model"}),
+        ({"policy_coef": 1e8}, {"policy"}),
+        ({"consistency_coef": 1e8, "policy_coef": 1e8}, {"model", "policy"}),
+        ({}, set()),
+    ],
+    ids=["huge model gradient", "huge policy gradient", "both", "neither"],
+)
+def test_the_gradients_of_model_and_policy_are_clipped_apart(huge, clipped):
+    world_model, batch = make_world_model(), make_batch()
+    small = {"consistency_coef": 1.0, "policy_coef": 1e-2}
+    reference = seeded_step(make_updater(copy.deepcopy(world_model), **small), batch)
+    updater = make_updater(world_model, **(small | huge))
+    recorded = applied_gradients(updater)
+    out = seeded_step(updater, batch)
+    for name in ("model", "policy"):
+        before_clipping = out[f"grad_norm_{name}"]
+        after_clipping = norm(recorded[name][0])
+        if name in clipped:
+            assert before_clipping > 1000 * CLIP
+            torch.testing.assert_close(after_clipping, torch.tensor(CLIP), rtol=1e-4, atol=0)
+        else:  # not touched by the other's size
+            assert 0 < before_clipping < CLIP
+            torch.testing.assert_close(after_clipping, before_clipping, rtol=1e-12, atol=0)
+            torch.testing.assert_close(before_clipping, reference[f"grad_norm_{name}"], rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("part", "rate", "epsilon"), [("encoder", 0.3 * LR, 1e-8), ("model", LR, 1e-8), ("policy", LR, 1e-5)]
+)
+def test_the_first_step_is_adam_s_with_the_learning_rate_and_epsilon_of_the_part(part, rate, epsilon):
+    # From rest, Adam moves by rate * g / (|g| + epsilon).
+    world_model = make_world_model()
+    updater = make_updater(world_model, policy_coef=1e-4)  # small gradients, so that the policy's epsilon shows
+    parameters = updater.policy_parameters if part == "policy" else updater.model_parameters
+    encoder = {id(p) for p in world_model.encoder.parameters()}
+    before = [parameter.detach().clone() for parameter in parameters]
+    recorded = applied_gradients(updater)
+    seeded_step(updater, make_batch())
+    gradients = recorded["policy" if part == "policy" else "model"][0]
+    checked = 0
+    for parameter, old, gradient in zip(parameters, before, gradients, strict=True):
+        if part == "policy" or (id(parameter) in encoder) == (part == "encoder"):
+            torch.testing.assert_close(parameter.detach(), old - rate * gradient / (gradient.abs() + epsilon))
+            checked += 1
+    assert checked > 0
+    if part == "policy":
+        assert torch.cat([gradient.flatten() for gradient in gradients]).abs().median() < 1e-4
+
+
+def test_without_distillation_the_policy_and_its_running_scale_stay_as_they_are():
+    updater, batch = make_updater(), make_batch()
+    before = snapshot(updater)
+    for _ in range(3):
+        out = seeded_step(updater, batch, distill=False)
+        assert not {"loss_policy", "policy_kl", "grad_norm_policy"} & set(out.keys())
+    after = snapshot(updater)
+    policy = [name for name in before if ".policy" in name or "kl_scale" in name]
+    assert any("kl_scale" in name for name in policy)
+    assert any("policy" in name for name in policy)
+    assert all(torch.equal(after[name], before[name]) for name in policy)
+    assert updater.policy_optimizer.state_dict()["state"] == {}
+    assert not torch.equal(after["world_model.encoder.output.weight"], before["world_model.encoder.output.weight"])
+
+
+def test_distillation_can_begin_after_pretraining():
+    updater, batch = make_updater(), make_batch()
+    seeded_step(updater, batch, distill=False)
+    before = snapshot(updater)
+    out = seeded_step(updater, batch)
+    assert {"loss_policy", "policy_kl", "grad_norm_policy"} <= set(out.keys())
+    assert updater.loss.kl_scale > before["loss.kl_scale"]
+    for name, parameter in updater.loss.world_model.policy.named_parameters():
+        assert not torch.equal(parameter, before[f"world_model.policy.{name}"]), name
+
+
+def test_a_policy_target_leaves_the_world_model_and_a_reward_leaves_the_policy_alone():
+    world_model, batch = make_world_model(), make_batch()
+    other_targets, other_rewards = batch.clone(), batch.clone()
+    other_targets["plan", "loc"] = -batch["plan", "loc"]
+    other_rewards["next", "reward"] = 5 - batch["next", "reward"]
+    trained = []
+    for data in (batch, other_targets, other_rewards):
+        updater = make_updater(copy.deepcopy(world_model))
+        seeded_step(updater, data)
+        trained.append(dict(updater.loss.world_model.named_parameters()))
+    for name, parameter in trained[0].items():
+        if name.startswith("policy"):
+            assert torch.equal(parameter, trained[2][name]), name
+        else:
+            assert torch.equal(parameter, trained[1][name]), name
+    assert not all(torch.equal(trained[0][name], trained[1][name]) for name in trained[0])
+    assert not all(torch.equal(trained[0][name], trained[2][name]) for name in trained[0])
+
+
+def test_one_backward_pass_equals_the_model_step_and_then_the_policy_step_on_the_old_latents():
+    world_model = make_world_model()
+    updater, separate = make_updater(world_model), SeparateSteps(copy.deepcopy(world_model))
+    for seed in range(3):
+        batch = make_batch()
+        seeded_step(updater, batch, seed=seed)
+        torch.manual_seed(seed)
+        separate.step(batch)
+    combined = snapshot(updater)
+    for name, value in separate.loss.world_model.state_dict().items():
+        if name != "version":
+            torch.testing.assert_close(combined[f"world_model.{name}"], value, rtol=1e-8, atol=1e-10, msg=name)
+    torch.testing.assert_close(updater.loss.kl_scale, separate.loss.kl_scale, rtol=1e-10, atol=0)
+    assert updater.loss.kl_scale > 1.01  # or the scale would have been tested at its floor only
+
+
+class SeparateSteps:
+    """The same update as two backward passes and two optimisers, one after the other."""
+
+    def __init__(self, world_model: WorldModel) -> None:
+        self.loss = EfficientTDMPCLoss(world_model, discount=0.9, distill=False)
+        self.target_update = SoftUpdate(self.loss, tau=TAU)
+        encoder = list(world_model.encoder.parameters())
+        heads = [*world_model.dynamics.parameters(), *world_model.reward_head.parameters()]
+        heads += world_model.value_head.parameters()
+        self.model_parameters = encoder + heads
+        self.policy_parameters = list(world_model.policy.parameters())
+        self.model_optimizer = torch.optim.Adam([{"params": encoder, "lr": 0.3 * LR}, {"params": heads}], lr=LR)
+        self.policy_optimizer = torch.optim.Adam(self.policy_parameters, lr=LR, eps=1e-5)
+
+    def step(self, batch: TensorDict) -> None:
+        world_model = self.loss.world_model
+        with torch.no_grad():  # before the model step
+            latents = [world_model.encode(batch["observation"][:, 0]).expand(2, -1, -1)]
+            for k in range(batch.shape[1] - 1):
+                latents.append(world_model.next(latents[-1], batch["action"][:, k]))
+            latents = torch.stack(latents)
+
+        out = self.loss(batch)
+        self.model_optimizer.zero_grad()
+        sum(value for name, value in out.items() if name.startswith("loss_")).backward()
+        torch.nn.utils.clip_grad_norm_(self.model_parameters, CLIP)
+        self.model_optimizer.step()
+
+        mean, log_std = world_model.policy(latents)
+        policy = torch.distributions.Normal(mean, log_std.exp())
+        plan = [batch["plan", name].transpose(0, 1).unsqueeze(1) for name in ("loc", "scale")]
+        kl = torch.distributions.kl_divergence(policy, torch.distributions.Normal(*plan)).mean(-1)
+        self.loss.kl_scale.copy_(updated_scale(self.loss.kl_scale, kl[0].detach(), TAU))
+        term = kl / self.loss.kl_scale - 1e-4 * ACTION_DIM * policy.entropy().sum(-1)
+        weights = 0.5 ** torch.arange(len(term), dtype=term.dtype)
+        self.policy_optimizer.zero_grad()
+        (weights * term.mean((1, 2))).mean().backward()
+        torch.nn.utils.clip_grad_norm_(self.policy_parameters, CLIP)
+        self.policy_optimizer.step()
+        self.target_update.step()
+
+
+def test_gradients_do_not_accumulate_over_updates():
+    updater, batch = make_updater(tau=0.0, lr=0.0), make_batch()  # nothing moves, so every gradient is the first again
+    recorded = applied_gradients(updater)
+    for distill in (True, True, False, True):
+        seeded_step(updater, batch, distill=distill)
+        assert all(parameter.grad is None for parameter in updater.loss.world_model.parameters())
+    assert (len(recorded["model"]), len(recorded["policy"])) == (4, 3)
+    for first, *others in recorded.values():
+        assert norm(first) > 0
+        for other in others:
+            assert all(torch.equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+def test_training_goes_on_bit_for_bit_from_a_saved_state():
+    original, batches = make_updater(), [make_batch() for _ in range(5)]
+    for seed, batch in enumerate(batches[:3]):
+        seeded_step(original, batch, seed=seed)
+    file = io.BytesIO()
+    parts = {"world_model": original.loss.world_model, "loss": original.loss, "optimisers": original}
+    torch.save({name: part.state_dict() for name, part in parts.items()}, file)
+    file.seek(0)
+    content = torch.load(file, weights_only=True)
+
+    restored = make_updater()
+    assert not torch.equal(restored.policy_parameters[0], original.policy_parameters[0])
+    restored.loss.world_model.load_state_dict(content["world_model"])
+    restored.loss.load_state_dict(content["loss"])
+    restored.load_state_dict(content["optimisers"])
+    assert restored.updates == 3
+    for seed, batch in enumerate(batches[3:]):
+        first, second = (seeded_step(updater, batch, seed=seed) for updater in (original, restored))
+        assert all(torch.equal(first[name], second[name]) for name in first.keys())
+    before, after = snapshot(original), snapshot(restored)
+    assert before.keys() == after.keys()
+    assert [name for name in before if not torch.equal(before[name], after[name])] == []
+
+
+def test_the_caller_s_batch_is_left_as_it_is():
+    batch = make_batch()
+    before = batch.clone()
+    seeded_step(make_updater(), batch)
+    assert (batch == before).all()
+    assert set(batch.keys(True, True)) == set(before.keys(True, True))
