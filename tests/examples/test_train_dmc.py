@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import importlib.machinery
 import importlib.util
 import json
 import os
@@ -91,11 +90,14 @@ def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(fini
     }
     assert set(file_hashes(directory)) == {str(run_dir / name) for name in expected}
     summary = json.loads((directory / run_dir / "summary.json").read_text())
+    *progress, closing = process.stdout.splitlines()
     assert re.fullmatch(
         rf"cartpole-balance: return {summary['final_return']:.1f} after 120 env steps in \d+ s; "
-        rf"curve, tables and checkpoint are in {re.escape(str(run_dir))}\n",
-        process.stdout,
+        rf"curve, tables and checkpoint are in {re.escape(str(run_dir))}",
+        closing,
     )
+    assert len(progress) == 2  # one log line per evaluation
+    assert all("[torchrl][INFO]" in line and " of 120: return " in line for line in progress)
     assert "Traceback" not in process.stderr
     assert "Warning" not in process.stderr
 

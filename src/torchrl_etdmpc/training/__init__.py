@@ -13,10 +13,12 @@ from torchrl_etdmpc.training.builders import (
 )
 from torchrl_etdmpc.training.checkpoint import CheckpointError, load_agent, read_checkpoint, save_checkpoint
 from torchrl_etdmpc.training.command_line import hydra_main, one_line_errors
-from torchrl_etdmpc.training.config import PRESETS, TrainConfig, preset
+from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.curve import plot_curve
 from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
+from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.progress import progress_bar
-from torchrl_etdmpc.training.run_log import RunLog, library_versions, plot_curve
+from torchrl_etdmpc.training.run_log import RunLog, library_versions
 from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
 from torchrl_etdmpc.training.video import write_mp4

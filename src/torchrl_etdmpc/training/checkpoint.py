@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from torchrl_etdmpc.training.atomic_file import replacing
 from torchrl_etdmpc.training.builders import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
@@ -46,12 +46,8 @@ def save_checkpoint(path: str | Path, agent: Agent, config: TrainConfig, counter
         "optimisers": agent.updater.state_dict(),
         "counters": dict(counters),
     }
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        torch.save(content, temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as partial:
+        torch.save(content, partial)
     return path
 
 

@@ -8,7 +8,8 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from torchrl_etdmpc.training.config import PRESETS, TrainConfig, config_from_dict, preset
+from torchrl_etdmpc.training.config import TrainConfig, config_from_dict
+from torchrl_etdmpc.training.presets import PRESETS, preset
 
 
 def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:

@@ -1,0 +1,70 @@
+"""The named configurations (thesis Table A.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl_etdmpc.training.config import (
+    LossConfig,
+    ModelConfig,
+    OptimConfig,
+    PlannerConfig,
+    ReanalyzeConfig,
+    ReplayConfig,
+    TrainConfig,
+)
+
+
+def _preset(name: str, **changes: Any) -> TrainConfig:
+    return TrainConfig(preset=name, **changes)
+
+
+def _efficient_tdmpc(name: str, updates_per_decision: int, reanalyze_every: int) -> TrainConfig:
+    return _preset(
+        name,
+        optim=OptimConfig(updates_per_decision=updates_per_decision),
+        reanalyze=ReanalyzeConfig(every=reanalyze_every),
+    )
+
+
+PRESETS: dict[str, TrainConfig] = {
+    config.preset: config
+    for config in (
+        _efficient_tdmpc("efficient-tdmpc", updates_per_decision=1, reanalyze_every=10),
+        _efficient_tdmpc("efficient-tdmpc-utd2", updates_per_decision=2, reanalyze_every=5),
+        _efficient_tdmpc("efficient-tdmpc-utd4", updates_per_decision=4, reanalyze_every=2),
+        _preset(
+            "bmpc",
+            model=ModelConfig(num_dynamics=1),
+            planner=PlannerConfig(horizon=3, score="final", eval_first_action="elite"),
+            reanalyze=ReanalyzeConfig(num_samples=512, num_elites=64, num_proposals=24),
+            replay=ReplayConfig(insertion="episode"),
+        ),
+        _preset(
+            "cpu",
+            total_env_steps=50_000,
+            eval_every=10_000,
+            threads=1,
+            model=ModelConfig(latent_dim=64, mlp_dim=96, encoder_dim=128, num_dynamics=2, activation="silu"),
+            planner=PlannerConfig(horizon=3, num_samples=48, num_elites=10, num_proposals=4, iterations=3),
+            reanalyze=ReanalyzeConfig(num_samples=24, num_elites=6, num_proposals=2, iterations=3, num_slices=6),
+            loss=LossConfig(tau=0.03),
+            optim=OptimConfig(batch_size=64, lr=1e-3),
+            replay=ReplayConfig(pretrain_updates=1000),
+        ),
+    )
+}
+
+
+def preset(name: str) -> TrainConfig:
+    """A preset by name.
+
+    Raises:
+        ValueError: if there is none of that name.
+
+    >>> preset("efficient-tdmpc-utd4").optim.updates_per_decision
+    4
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}.")
+    return PRESETS[name]
