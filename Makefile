@@ -19,7 +19,7 @@ help:
 	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
 
 train: $(READY)
-	@$(VENV)/bin/python examples/train_dmc.py task=walker-stand preset=cpu seed=1 total_env_steps=40000 eval_every=5000 run_dir=$(RUN_DIR) $(ARGS)
+	@$(VENV)/bin/python examples/train_dmc.py task=walker-stand preset=cpu seed=1 total_env_steps=25000 eval_every=5000 run_dir=$(RUN_DIR) $(ARGS)
 
 test: export MUJOCO_GL ?= disable
 test: $(READY)

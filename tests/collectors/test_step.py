@@ -266,6 +266,18 @@ def test_both_insertions_store_the_same_transitions():
 
 
 @pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+def test_a_consumer_that_writes_into_a_yielded_step_does_not_change_what_is_stored(insertion, lengths):
+    replay = make_replay()
+    for step in StepCollector(
+        make_env(lengths), RandomActions(), replay_buffer=replay, total_frames=30, insertion=insertion
+    ):
+        step["next", "reward"].fill_(777)
+    assert len(replay) > 0
+    assert not (replay.storage[:]["next", "reward"] == 777).any()
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
 def test_what_is_stored_equals_an_independent_replay_of_the_actions(lengths):
     replay = make_replay()
     collector = StepCollector(make_env(lengths), RandomActions(), replay_buffer=replay, total_frames=40)

@@ -347,13 +347,14 @@ def test_a_latent_can_take_the_place_of_the_observation():
     assert_same_plan(planner.plan(latent=latent, noise=noise), planner.plan(observation, noise=noise))
 
 
-def test_a_latent_in_the_input_takes_precedence_over_an_observation():
-    # A rollout in the latent env keeps the observation that it began with.
+def test_an_observation_beside_a_latent_is_refused_unless_latents_are_not_read():
+    # A rollout in the latent env keeps the observation that it began with; a pipeline may carry a stale latent.
     model, observation = make_model(), states(3)
-    planner = make_planner(model)
-    td = TensorDict({"observation": states(3), "latent": model.encode(observation)}, batch_size=[3])
-    out = run(planner, td)
-    torch.testing.assert_close(out["plan", "loc"], expected_plan(planner, observation, None).loc)
+    td = TensorDict({"observation": observation, "latent": model.encode(states(3))}, batch_size=[3])
+    with pytest.raises(ValueError, match="found both 'observation' and 'latent'"):
+        run(make_planner(model), td)
+    out = run(make_planner(model, latent_key=None), td)
+    torch.testing.assert_close(out["plan", "loc"], expected_plan(make_planner(model), observation, None).loc)
 
 
 # Warm start

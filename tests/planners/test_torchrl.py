@@ -152,7 +152,8 @@ def test_a_batch_of_imaginations_is_planned_at_once(monkeypatch):
     planner = make_planner(LineWorld(goal=1.0), warm_start=False)
     calls = record_starts(monkeypatch, planner)
     start = TensorDict({"observation": torch.linspace(-1, 3, 6).view(3, 2, 1)}, batch_size=[3, 2])
-    data = planner.env.rollout(8, planner, tensordict=planner.env.reset(start), auto_reset=False)
+    start = planner.env.reset(start).exclude("observation")
+    data = planner.env.rollout(8, planner, tensordict=start, auto_reset=False)
     assert data.batch_size == (3, 2, 8)
     torch.testing.assert_close(data["latent"][..., -1, 0], torch.ones(3, 2), atol=0.3, rtol=0)
     assert [mean.shape for _, mean in calls] == [(3, 2, 3, 1)] * 8

@@ -36,8 +36,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     Each candidate action sequence is rolled through every dynamics head; the table of return estimates over depths,
     dynamics heads and value heads (thesis Eq. 3.1) is reduced to a score by ``score``. The planner acts on a real
-    environment (it reads ``observation``) as well as on the :class:`LatentEnv` it holds (it reads ``latent``, which
-    takes precedence: an imagined rollout keeps the observation that it began with).
+    environment (it reads ``observation``) as well as on the :class:`LatentEnv` it holds (it reads ``latent``).
 
     It obeys :func:`torchrl.envs.utils.exploration_type`: with ``RANDOM`` (a collector's default) the action is a sample
     and the target's mean comes from ``first_action``; otherwise the action is the mean from ``eval_first_action``.
@@ -73,6 +72,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         proposal_log_std_bounds (tuple of float, optional): bounds of the policy's log std while it proposes; BMPC
             widens them to (-2, 1) for reanalyze. Default: the policy's own.
         observation_key, action_key, is_init_key, plan_mean_key (NestedKey): tensordict keys.
+        latent_key (NestedKey, optional): where a :class:`LatentEnv` holds its state. ``None``: plan from observations
+            only. Default: ``"latent"``.
         plan_key (NestedKey): root of the target: ``loc``, ``scale``, ``value``, ``version`` and ``fallback`` below it.
 
     Raises:
@@ -108,6 +109,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         warm_start: bool = True,
         proposal_log_std_bounds: tuple[float, float] | None = None,
         observation_key: NestedKey = "observation",
+        latent_key: NestedKey | None = "latent",
         action_key: NestedKey = "action",
         is_init_key: NestedKey = "is_init",
         plan_mean_key: NestedKey = "plan_mean",
@@ -155,6 +157,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.warm_start = warm_start
         self.proposal_log_std_bounds = proposal_log_std_bounds
         self.observation_key = unravel_key(observation_key)
+        self.latent_key = None if latent_key is None else unravel_key(latent_key)
         self.is_init_key = unravel_key(is_init_key)
         self.plan_mean_key = unravel_key(plan_mean_key)
         self.next_plan_mean_key = unravel_key(("next", plan_mean_key))
@@ -192,19 +195,25 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         """Plans for every state of the batch and writes action, target and warm start.
 
         Args:
-            tensordict (TensorDictBase): ``latent [..., L]`` or, without one, ``observation [..., O]``, and for the warm
-                start ``plan_mean [..., H, A]`` and ``is_init [..., 1]``, each optional.
+            tensordict (TensorDictBase): ``observation [..., O]`` or ``latent [..., L]``, and for the warm start
+                ``plan_mean [..., H, A]`` and ``is_init [..., 1]``, each optional.
             tensordict_out (TensorDictBase, optional): where to write. Default: ``tensordict``.
 
         Raises:
             KeyError: if neither an observation nor a latent is present.
+            ValueError: if both are present.
         """
-        latent = tensordict.get("latent", None)
-        observation = tensordict.get(self.observation_key, None) if latent is None else None
+        observation = tensordict.get(self.observation_key, None)
+        latent = None if self.latent_key is None else tensordict.get(self.latent_key, None)
         if observation is None and latent is None:
             raise KeyError(
                 f"the planner needs {self.observation_key!r} (or 'latent') in its input; pass observation_key=... if "
                 "your environment names it otherwise."
+            )
+        if observation is not None and latent is not None:
+            raise ValueError(
+                f"the planner found both {self.observation_key!r} and {self.latent_key!r} in its input and cannot tell "
+                "which one is current; exclude one of them, or pass latent_key=None to plan from observations only."
             )
         explore = exploration_type() is ExplorationType.RANDOM
         carried, carry = self._read_warm_start(tensordict)
