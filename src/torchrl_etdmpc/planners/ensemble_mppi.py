@@ -19,12 +19,12 @@ from torchrl_etdmpc.functional import (
     clipped_sample,
     elite_weights,
     fit_gaussian,
-    return_table,
     sample_elite,
     sample_sequences,
     select_elites,
     shift_plan,
 )
+from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
 from torchrl_etdmpc.planners.scores import Score, make_score
 
@@ -302,8 +302,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         start = latent.new_zeros(shape) if plan_mean is None else shift_plan(plan_mean.reshape(shape))
         gaussian = Gaussian(start, torch.full_like(start, self.std_max))
 
-        proposals = self._propose(latent, noise.proposals)
         if self.num_proposals:
+            bounds = self.proposal_log_std_bounds
+            proposals = propose_sequences(self.world_model, latent, noise.proposals, bounds)
             proposal_scores, proposal_returns = self._evaluate(latent, proposals)
         steps = []
         for iteration in range(self.iterations):
@@ -350,50 +351,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         if choice == "best":
             return first[:, 0], scores[:, 0]
         index = sample_elite(weights, uniform).unsqueeze(-1)
-        return first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1])).squeeze(1), scores.gather(
-            1, index
-        ).squeeze(1)
-
-    def _propose(self, latent: Tensor, noise: Tensor) -> Tensor:
-        """Rolls the policy: ``[B, L]`` and noise ``[B, P, H, A]`` to sequences ``[B, P, H, A]``."""
-        # Proposal p is rolled with dynamics head p mod F.
-        if not self.num_proposals:
-            return noise
-        model, heads = self.world_model, self.world_model.num_dynamics
-        rounds = -(-self.num_proposals // heads)
-        noise = torch.nn.functional.pad(noise, (0, 0, 0, 0, 0, rounds * heads - self.num_proposals))
-        noise = noise.unflatten(1, (rounds, heads)).permute(2, 3, 0, 1, 4)  # [F, H, B, rounds, A]
-        latent = latent[None, :, None].expand(heads, -1, rounds, -1)
-        actions = []
-        for step in range(self.horizon):
-            actions.append(model.act(latent, noise[:, step], self.proposal_log_std_bounds))
-            if step + 1 < self.horizon:
-                latent = model.next(latent, actions[-1])
-        sequences = torch.stack(actions, dim=-2)  # [F, B, rounds, H, A]
-        return sequences.permute(1, 2, 0, 3, 4).flatten(1, 2)[:, : self.num_proposals]
+        action = first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1]))
+        return action.squeeze(1), scores.gather(1, index).squeeze(1)
 
     def _evaluate(self, latent: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]`` from ``[B, L]``."""
-        model = self.world_model
         all_depths = getattr(self.score, "depths", "all") != "last"
-        latent = latent[None, :, None].expand(1, -1, actions.shape[1], -1)
-        rewards, values, alive = [], [], []
-        for step in range(self.horizon):
-            action = actions[:, :, step]
-            reward = model.reward(latent, action)  # at the first step all heads stand on the same latent
-            rewards.append(reward.expand(model.num_dynamics, -1, -1))
-            latent = model.next(latent, action)
-            if all_depths or step + 1 == self.horizon:
-                values.append(model.values(latent))
-            ended = model.termination(latent)
-            if ended is not None:
-                alive.append((1 - ended) * (alive[-1] if alive else 1))
-        returns = return_table(
-            torch.stack(rewards).permute(2, 3, 0, 1),
-            torch.stack(values).permute(2, 3, 0, 1, 4),
-            self.discount,
-            torch.stack(alive).permute(2, 3, 0, 1) if alive else None,
-        )
+        returns = imagined_returns(self.world_model, latent, actions, discount=self.discount, all_depths=all_depths)
         scores = self.score(returns)
         if scores.shape != actions.shape[:2]:
             raise ValueError(
