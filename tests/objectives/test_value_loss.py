@@ -24,6 +24,7 @@ def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step
     errors = plain_errors(loss, slices, _noise(slices))
     out = run_seeded(loss, slices)
     torch.testing.assert_close(out["value_target"], errors["value_target"].mean())
+    torch.testing.assert_close(out["value_error"], errors["value"].mean().detach())  # knows neither coefficient nor rho
     torch.testing.assert_close(out["loss_value"], 0.1 * depth_mean(errors["value"]))
 
 

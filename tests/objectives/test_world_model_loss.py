@@ -35,6 +35,8 @@ def test_the_terms_equal_a_plain_reference_written_head_by_head_and_step_by_step
     torch.testing.assert_close(out["loss_consistency"], 20 * depth_mean(errors["consistency"]))
     torch.testing.assert_close(out["loss_reward"], 0.1 * depth_mean(errors["reward"]))
     torch.testing.assert_close(out["loss_termination"], errors["termination"].mean())
+    for term in ("consistency", "reward", "termination"):  # the metrics know neither coefficient nor rho
+        torch.testing.assert_close(out[f"{term}_error"], errors[term].mean().detach())
 
 
 @pytest.mark.parametrize(
