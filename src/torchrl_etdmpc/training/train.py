@@ -48,6 +48,7 @@ class TrainingRun:
         self.eval_returns: list[float] = []
         self._episode_returns: list[float] = []  # training episodes since the last row of train.csv
         self._metrics: dict[str, torch.Tensor] = {}
+        self._threads = torch.get_num_threads()  # closing a batched environment changes it
         self._start = time.perf_counter()
         self._learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
 
@@ -171,7 +172,7 @@ class TrainingRun:
             "decisions_per_second": learned / self._learning_s if self._learning_s else math.nan,
             "parameters": sum(parameter.numel() for parameter in self.agent.world_model.parameters()),
             "device": torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
-            "threads": torch.get_num_threads(),
+            "threads": self._threads,
         }
 
     def _passed(self, interval: int) -> bool:
