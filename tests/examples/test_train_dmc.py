@@ -96,8 +96,8 @@ def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(fini
         rf"curve, tables and checkpoint are in {re.escape(str(run_dir))}",
         closing,
     )
-    assert len(progress) == 2  # one log line per evaluation
-    assert all("[torchrl][INFO]" in line and " of 120: return " in line for line in progress)
+    assert all("[torchrl][INFO]" in line for line in progress)  # TorchRL has one of its own, on the storage
+    assert sum(" of 120: return " in line for line in progress) == 2  # one per evaluation
     assert "Traceback" not in process.stderr
     assert "Warning" not in process.stderr
 
