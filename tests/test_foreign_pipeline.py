@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer, TensorDictRoundRobinWriter
 from torchrl.envs import ActionScaling, Compose, GymEnv, InitTracker, RenameTransform, TransformedEnv
@@ -218,6 +219,21 @@ def test_the_planner_drives_a_rollout_with_other_keys():
     assert rollout[ACTION].shape == (5, 1)
     assert torch.equal(rollout[PLAN_MEAN][1:], rollout["next", *PLAN_MEAN][:-1])
     assert (rollout[PLAN_MEAN][0] == 0).all() and (rollout[PLAN_MEAN][1:] != 0).any()
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_the_planner_drops_the_carried_plan_where_the_renamed_flag_says_so(begins):
+    planner = make_planner(make_model())
+    state, carried = torch.randn(4, 3), torch.ones(4, 3, 1)
+    data = TensorDict({OBSERVATION: state, PLAN_MEAN: carried, IS_INIT: torch.full((4, 1), begins)}, [4])
+    torch.manual_seed(1)
+    out = planner(data)
+    torch.manual_seed(1)
+    expected = planner.plan(state, torch.zeros_like(carried) if begins else carried)
+    torch.manual_seed(1)
+    other = planner.plan(state, carried if begins else torch.zeros_like(carried))
+    assert torch.equal(out["next", *PLAN_MEAN], expected.mean)
+    assert not torch.equal(out["next", *PLAN_MEAN], other.mean)
 
 
 def test_none_of_the_parts_imports_the_training_layer():
