@@ -79,7 +79,9 @@ class Ring:
             return set()
         assert self.sampler.can_sample(self.buffer.storage, self.slice_len)
         trajectories = len({trajectory for trajectory, _ in self.history[-self.capacity :]})
-        return {tuple(rows) for rows in np.unique(self.draw(40 * trajectories * self.capacity), axis=0).tolist()}
+        drawn = self.draw(40 * trajectories * self.capacity)
+        _, first = np.unique(drawn @ self.capacity ** np.arange(self.slice_len), return_index=True)
+        return {tuple(rows) for rows in drawn[first].tolist()}
 
 
 def interleaved(lengths: list[int], num_envs: int, rows: int, first: int = 0) -> list[tuple[int, int]]:
