@@ -357,6 +357,13 @@ def test_an_observation_beside_a_latent_is_refused_unless_latents_are_not_read()
     torch.testing.assert_close(out["plan", "loc"], expected_plan(make_planner(model), observation, None).loc)
 
 
+def test_the_key_of_the_latent_can_be_renamed():
+    model, observation = make_model(), states(3)
+    td = TensorDict({"agent": {"z": model.encode(observation)}, "latent": states(3)}, batch_size=[3])
+    out = run(make_planner(model, latent_key=("agent", "z")), td)
+    torch.testing.assert_close(out["plan", "loc"], expected_plan(make_planner(model), observation, None).loc)
+
+
 # Warm start
 
 

@@ -66,13 +66,29 @@ def test_the_networks_have_the_sizes_of_the_preset(name):
     model = build_world_model(config, OBSERVATION_DIM, ACTION_DIM)
     weights = {name: parameter.shape for name, parameter in model.named_parameters()}
     assert weights["encoder.hidden.0.weight"][-2:] == (OBSERVATION_DIM, config.encoder_dim)
+    assert "encoder.hidden.1.weight" not in weights
     assert weights["dynamics.hidden.1.weight"] == (config.num_dynamics, config.mlp_dim, config.mlp_dim)
     assert weights["value_head.output.weight"] == (config.num_values, config.mlp_dim, config.num_bins)
     assert weights["policy.output.weight"][-1] == 2 * ACTION_DIM
     assert model.encode(torch.zeros(OBSERVATION_DIM)).shape == (config.latent_dim,)
     assert (model.bins[0].item(), model.bins[-1].item(), len(model.bins)) == (-10, 10, 101)
     assert model.policy.log_std_bounds == (-3, 1)
+    assert [layer.dropout for layer in model.value_head.hidden] == [0.01, 0]
     assert model.termination_head is None
+
+
+def test_the_networks_that_no_preset_changes_can_be_changed():
+    options = {"encoder_layers": 2, "dropout": 0.25, "activation": "relu", "termination": True, "simnorm_dim": 4}
+    options |= {"bin_min": -2.0, "bin_max": 3.0, "num_bins": 11, "log_std_min": -1.0, "log_std_max": 2.0}
+    model = build_world_model(tiny_config(model=options).model, OBSERVATION_DIM, ACTION_DIM)
+    assert len(model.encoder.hidden) == 2
+    assert model.value_head.hidden[0].dropout == 0.25
+    assert model.encoder.hidden[0].activation is torch.nn.functional.relu
+    assert model.termination_head is not None
+    latent = model.encode(torch.randn(OBSERVATION_DIM))
+    assert latent.sum().item() == pytest.approx(16 / 4)  # every group of SimNorm sums to one
+    torch.testing.assert_close(model.bins, torch.linspace(-2, 3, 11))
+    assert model.policy.log_std_bounds == (-1, 2)
 
 
 def test_every_setting_of_the_planner_arrives():

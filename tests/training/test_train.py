@@ -111,6 +111,22 @@ def test_evaluations_are_at_the_start_at_every_interval_and_at_the_end(finished)
     assert all(0 < row["return_mean"] <= 2 * EPISODE for row in rows)
 
 
+def test_an_evaluation_due_at_the_end_of_the_seed_phase_is_of_the_pretrained_agent(tmp_path):
+    make_run(tiny_config(eval_every=60, total_env_steps=70), tmp_path).run()
+    rows = read_table(tmp_path / "eval.csv")
+    assert [(row["env_steps"], row["updates"]) for row in rows] == [(0, 0), (60, 7), (70, 7 + 2 * 5)]
+
+
+def test_training_does_not_depend_on_how_often_it_is_evaluated(tmp_path):
+    often = make_run(tiny_config(eval_every=10, total_env_steps=90), tmp_path / "often")
+    often.run()
+    seldom = make_run(tiny_config(eval_every=1000, total_env_steps=90), tmp_path / "seldom")
+    seldom.run()
+    assert torch.equal(often.replay[:]["action"], seldom.replay[:]["action"])
+    weights = zip(often.agent.loss.state_dict().values(), seldom.agent.loss.state_dict().values(), strict=True)
+    assert all(torch.equal(one, other) for one, other in weights)
+
+
 def test_a_training_row_is_written_at_every_interval_after_the_seed_phase(finished):
     rows = read_table(finished.path / "train.csv")
     assert [row["env_steps"] for row in rows] == [80, 120, 160]

@@ -79,6 +79,8 @@ class TrainingRun:
                 for _ in range(math.ceil(config.seed_decisions / config.num_envs)):
                     self.step()
                 self.pretrain()
+                if config.seed_decisions and self._passed(config.eval_every):
+                    self.evaluate()
                 while self.env_steps < config.total_env_steps:
                     tick = time.perf_counter()
                     self.step()
@@ -127,9 +129,13 @@ class TrainingRun:
             self.reanalyze.enabled = True
 
     def evaluate(self) -> None:
-        """Appends a row to ``eval.csv``."""
+        """Appends a row to ``eval.csv``. Training draws the same random numbers whether it is evaluated or not."""
         options = {"episodes": self.config.eval_episodes, "policy_device": self.device}
-        returns = evaluate(self.eval_env, self.agent.eval_planner, **options)
+        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+            returns = evaluate(self.eval_env, self.agent.eval_planner, **options)
+            if self.config.eval_policy:
+                bare = evaluate(self.eval_env, BarePolicy(self.agent.world_model), **options)
+                self._metrics["policy_return"] = bare.mean()
         self.eval_returns.append(returns.mean().item())
         self.log.log_eval(
             **self.counters(),
@@ -137,9 +143,6 @@ class TrainingRun:
             return_std=returns.std(correction=0).item(),
             episodes=len(returns),
         )
-        if self.config.eval_policy:
-            bare = evaluate(self.eval_env, BarePolicy(self.agent.world_model), **options)
-            self._metrics["policy_return"] = bare.mean()
 
     def write_metrics(self) -> None:
         """Appends a row to ``train.csv``."""

@@ -1,0 +1,201 @@
+"""Learning curves as tidy tables, from run directories and from CSV files of published baselines.
+
+Two kinds of table, one row per evaluation, ``env_steps`` always in environment steps:
+
+- *seed curves*: ``method, task, seed, env_steps, return_mean``;
+- *estimates*: ``method, task, env_steps, mean, standard_error, seeds`` (see :mod:`torchrl_etdmpc.analysis.statistics`).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+import yaml
+
+from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
+
+SEED_COLUMNS = ("method", "task", "seed", "env_steps", "return_mean")
+ESTIMATE_COLUMNS = ("method", "task", "env_steps", "mean", "standard_error", "seeds")
+_ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
+
+
+def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The run directories in or below the paths: those that hold an ``eval.csv``.
+
+    Args:
+        paths: run directories, or folders of run directories at any depth.
+
+    Returns:
+        list of Path: sorted, each once.
+
+    Raises:
+        FileNotFoundError: a path that does not exist, or without a run in or below it.
+    """
+    runs: set[Path] = set()
+    for path in map(Path, paths):
+        if not path.exists():
+            raise FileNotFoundError(f"no such run directory: {path}.")
+        found = {file.parent for file in path.rglob("eval.csv")}
+        if not found:
+            raise FileNotFoundError(f"no runs found in {path}; a run directory holds an eval.csv.")
+        runs |= found
+    return sorted(runs)
+
+
+def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> pd.DataFrame:
+    """The seed curve of one run, which may still be running.
+
+    A last line without its line end is still being written and is left out; of rows with the same ``env_steps`` (a run
+    that was resumed) the last counts.
+
+    Args:
+        run_dir: holds ``eval.csv`` and one of ``config.yaml`` and ``summary.json``, which give task, preset and seed.
+        method: how figures and tables call the run. Default: its preset.
+
+    Returns:
+        pandas.DataFrame: seed curve. Empty if the run has not evaluated yet.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is not what it should be, or counts steps in other units.
+    """
+    run_dir = Path(run_dir)
+    header = _header(run_dir)
+    text = (run_dir / "eval.csv").read_text(encoding="utf-8", errors="replace")
+    table = _parse(text[: text.rfind("\n") + 1], run_dir / "eval.csv", ("env_steps", "return_mean"), empty=True)
+    _check_units(table.assign(task=header["task"]), run_dir / "eval.csv")
+    table = table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
+    return pd.DataFrame(
+        {
+            "method": method or str(header["preset"]),
+            "task": str(header["task"]),
+            "seed": int(header["seed"]),
+            "env_steps": table["env_steps"].astype(float),
+            "return_mean": table["return_mean"].astype(float),
+        }
+    )
+
+
+def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = None) -> pd.DataFrame:
+    """The seed curves of all runs in or below the paths.
+
+    Raises:
+        FileNotFoundError: no run in one of the paths.
+        ValueError: two runs of the same method, task and seed, or a file that cannot be read.
+    """
+    tables, seen = [], {}
+    for run_dir in find_runs(paths):
+        table = read_run(run_dir, method=method)
+        header = _header(run_dir)
+        key = (method or header["preset"], header["task"], header["seed"])
+        if key in seen:
+            raise ValueError(
+                f"two runs of {key[0]} on {key[1]} with seed {key[2]}: {seen[key]} and {run_dir}; leave one out, or "
+                "give one of them a name of its own."
+            )
+        seen[key] = run_dir
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
+
+
+def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
+    """Learning curves of a baseline from a CSV file, per seed or as means.
+
+    Per seed the columns are ``method, task, seed, env_steps, return_mean``; as means they are ``method, task,
+    env_steps, mean`` and, where known, ``standard_error`` and ``seeds`` (number of runs). Other columns are ignored.
+
+    Args:
+        file: the CSV file. Steps are environment steps.
+
+    Returns:
+        pandas.DataFrame: seed curves or estimates, whichever the file holds.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not a CSV file, missing columns, steps in other units, or two rows for one evaluation.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"no such file of learning curves: {file}.")
+    text = file.read_text(encoding="utf-8", errors="replace")
+    table = _parse(text, file, ("method", "task", "env_steps"))
+    if {"seed", "return_mean"} <= set(table):
+        key, numbers, columns = ["method", "task", "seed", "env_steps"], ["env_steps", "return_mean"], SEED_COLUMNS
+    elif "mean" in table:
+        table = table.reindex(columns=[*table, *({"standard_error", "seeds"} - set(table))])
+        key, numbers = ["method", "task", "env_steps"], ["env_steps", "mean", "standard_error", "seeds"]
+        columns = ESTIMATE_COLUMNS
+    else:
+        raise ValueError(f"{file} has neither the columns seed, return_mean (one row per seed) nor mean; add them.")
+    _numbers(table, numbers, file)
+    _check_units(table, file)
+    double = table[table.duplicated(key)]
+    if len(double):
+        row = double.iloc[0]
+        raise ValueError(f"{file} has two rows for {', '.join(f'{name}={row[name]}' for name in key)}; keep one.")
+    return table[list(columns)].sort_values(key, ignore_index=True)
+
+
+def _header(run_dir: Path) -> dict[str, object]:
+    """Task, preset and seed of a run."""
+    for name in ("config.yaml", "summary.json"):
+        if (run_dir / name).is_file():
+            break
+    else:
+        raise FileNotFoundError(f"{run_dir} has neither config.yaml nor summary.json, which name its task and seed.")
+    text = (run_dir / name).read_text(encoding="utf-8", errors="replace")
+    try:
+        values = json.loads(text) if name == "summary.json" else yaml.safe_load(text)
+        return {key: values[key] for key in ("task", "preset", "seed")}
+    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed.") from error
+
+
+def _parse(text: str, file: Path, columns: tuple[str, ...], *, empty: bool = False) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(io.StringIO(text))
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError) as error:
+        if empty and not text.strip():
+            return pd.DataFrame(columns=list(columns), dtype=float)
+        raise ValueError(f"{file} is not a CSV file with a header line ({' '.join(str(error).split())}).") from error
+    table.columns = table.columns.str.strip()
+    if "env_steps" not in table and "decision_steps" in table:
+        raise ValueError(
+            f"{file} counts decision_steps only; add a column env_steps (decision steps times the action repeat)."
+        )
+    missing = [name for name in columns if name not in table]
+    if missing:
+        raise ValueError(f"{file} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}.")
+    _numbers(table, [name for name in ("env_steps", "return_mean") if name in columns], file)
+    return table
+
+
+def _numbers(table: pd.DataFrame, columns: list[str], file: Path) -> None:
+    """Makes the columns floats; an empty cell is NaN."""
+    for name in columns:
+        try:
+            table[name] = pd.to_numeric(table[name]).astype(float)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{file}: column {name} must hold numbers ({' '.join(str(error).split())}).") from error
+    steps = table["env_steps"]
+    if steps.isna().any() or (steps < 0).any():
+        raise ValueError(f"{file}: every row needs env_steps of at least 0.")
+
+
+def _check_units(table: pd.DataFrame, file: Path) -> None:
+    """Refuses steps that are not environment steps."""
+    if "decision_steps" not in table:
+        return
+    repeat = table["task"].map(_ACTION_REPEAT)
+    wrong = table[repeat.notna() & (table["env_steps"] != table["decision_steps"] * repeat)]
+    if len(wrong):
+        row = wrong.iloc[0]
+        raise ValueError(
+            f"{file} mixes units: {row['env_steps']:.0f} env_steps beside {row['decision_steps']:.0f} decision_steps, "
+            f"but {row['task']} has {_ACTION_REPEAT[row['task']]} env steps per decision; write environment steps."
+        )

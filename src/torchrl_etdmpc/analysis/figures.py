@@ -1,0 +1,134 @@
+"""Figures of learning curves and areas, for pages and papers: colour-blind safe, one colour per method everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from torchrl_etdmpc.analysis.statistics import add_interval
+
+# The palette of Okabe and Ito, which people with any colour vision tell apart. Published baselines keep their colour in
+# every report; the rest goes to the runs in their order.
+_BASELINES = {"BMPC": "#D55E00", "TD-MPC2": "#009E73", "DreamerV3": "#CC79A7", "SAC": "#E69F00"}
+_RUNS = ("#0072B2", "#56B4E9", "#000000")
+_DASHES = ("-", "--", ":", "-.")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+
+def method_styles(methods: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Colour, dash and marker of each method, the same in every figure.
+
+    >>> method_styles(["mine", "BMPC"])["BMPC"]["color"]
+    '#D55E00'
+    """
+    styles, others = {}, 0
+    for method in methods:
+        if method in _BASELINES:
+            index = list(_BASELINES).index(method)
+            styles[method] = {"color": _BASELINES[method], "linestyle": "-", "marker": _MARKERS[1 + index]}
+        else:
+            color, dash = _RUNS[others % len(_RUNS)], _DASHES[others // len(_RUNS) % len(_DASHES)]
+            styles[method] = {"color": color, "linestyle": dash, "marker": "o"}
+            others += 1
+    return styles
+
+
+def plot_curves(estimates: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str], budget: float) -> Figure:
+    """A grid of tasks: mean return against env steps, shaded 95% intervals (none where the standard error is unknown).
+
+    Args:
+        estimates (DataFrame): of returns.
+        tasks (sequence of str): one panel each.
+        methods (sequence of str): in the order of the legend.
+        budget (float): right end of the axis, env steps.
+    """
+    columns = min(len(tasks), 4 if len(tasks) > 4 else 2)
+    rows = -(-len(tasks) // columns)
+    figure = Figure(figsize=(max(3.1 * columns, 4.5), 2.4 * rows + 0.6), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    styles = method_styles(methods)
+    for axis, task in zip(axes.flat, tasks, strict=False):
+        for method in methods:
+            curve = estimates[(estimates["task"] == task) & (estimates["method"] == method)]
+            _line(axis, curve, method, styles[method])
+        axis.set_title(task, fontsize=10)
+        _dress(axis, budget)
+    for axis in axes.flat[len(tasks) :]:
+        axis.remove()
+    figure.supxlabel("environment steps", fontsize=10)
+    figure.supylabel("episode return", fontsize=10)
+    _legend(figure, axes.flat[0])
+    return figure
+
+
+def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: float, ylabel: str) -> Figure:
+    """Aggregate normalised curves with shaded 95% intervals.
+
+    Args:
+        aggregates (DataFrame): see :func:`torchrl_etdmpc.analysis.aggregate`.
+        methods (sequence of str): in the order of the legend.
+        budget (float): right end of the axis, env steps.
+        ylabel (str): what the values are.
+    """
+    figure = Figure(figsize=(4.8, 3.4), layout="constrained")
+    axis = figure.subplots()
+    styles = method_styles(methods)
+    for method in methods:
+        _line(axis, aggregates[aggregates["method"] == method], method, styles[method])
+    _dress(axis, budget)
+    axis.set_xlabel("environment steps")
+    axis.set_ylabel(ylabel)
+    _legend(figure, axis)
+    return figure
+
+
+def plot_auc(areas: pd.DataFrame, *, methods: Sequence[str], ylabel: str) -> Figure:
+    """Bars of aggregate areas with 95% intervals; a method without a value gets no bar and the word "unavailable".
+
+    Args:
+        areas (DataFrame): ``method, auc, standard_error``, one row per method.
+        methods (sequence of str): in the order of the bars.
+        ylabel (str): what the values are.
+    """
+    figure = Figure(figsize=(max(0.9 * len(methods) + 1.2, 3.2), 3.2), layout="constrained")
+    axis = figure.subplots()
+    styles = method_styles(methods)
+    table = areas.set_index("method").reindex(methods)
+    for place, (method, row) in enumerate(table.iterrows()):
+        if np.isnan(row["auc"]):
+            axis.text(place, 0, " unavailable", rotation=90, ha="center", va="bottom", fontsize=8, color="0.4")
+            continue
+        half = 1.96 * row["standard_error"]
+        axis.bar(place, row["auc"], color=styles[method]["color"], width=0.7)
+        if not np.isnan(half):
+            axis.errorbar(place, row["auc"], yerr=half, color="black", capsize=3, linewidth=1)
+    axis.set_xlim(-0.6, len(methods) - 0.4)
+    axis.set_xticks(range(len(methods)), methods, rotation=20, ha="right")
+    axis.set_ylabel(ylabel)
+    axis.grid(axis="y", linewidth=0.5, alpha=0.4)
+    axis.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _line(axis, curve: pd.DataFrame, method: str, style: dict[str, str]) -> None:
+    curve = add_interval(curve.dropna(subset="mean")).sort_values("env_steps")
+    axis.plot(curve["env_steps"], curve["mean"], label=method, linewidth=1.5, markersize=2.5, **style)
+    axis.fill_between(curve["env_steps"], curve["lower"], curve["upper"], color=style["color"], alpha=0.18, linewidth=0)
+
+
+def _dress(axis, budget: float) -> None:
+    axis.set_xlim(0, budget * 1.02)
+    axis.margins(y=0.05)
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axis.grid(linewidth=0.5, alpha=0.4)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8)
+
+
+def _legend(figure: Figure, axis) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5), frameon=False, fontsize=9)

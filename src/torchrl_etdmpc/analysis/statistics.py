@@ -1,0 +1,224 @@
+"""Estimates over seeds, normalisation, aggregates and areas under learning curves (thesis appendix A.1.2).
+
+Pure functions on tidy tables. *Estimates* have one row per method, task and step: ``method, task, env_steps, mean,
+standard_error, seeds``, further columns are kept. ``standard_error`` is NaN where it is not known: for one seed, or for
+a published mean without one. Steps are environment steps; nothing is ever extrapolated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+Z_95 = 1.96  # half-width of a 95% interval in standard errors, as the thesis has it
+NORMALISER = "BMPC"
+
+
+def estimate(seed_curves: pd.DataFrame) -> pd.DataFrame:
+    r"""Mean over seeds and its standard error at every evaluation step.
+
+    .. math:: \hat\mu_t = \frac1N \sum_j R_{j,t}, \quad
+        \hat\sigma_t^2 = \frac1{N-1} \sum_j (R_{j,t} - \hat\mu_t)^2, \quad \hat s_t = \hat\sigma_t / \sqrt N
+
+    (thesis A.1.2, "Per-task learning curves"). A step counts the seeds that were evaluated there; a NaN return is a
+    missing evaluation.
+
+    Args:
+        seed_curves (DataFrame): ``method, task, seed, env_steps, return_mean``.
+
+    Returns:
+        DataFrame: estimates.
+
+    >>> rows = [("a", "walker-run", seed, 0, 10.0 * seed) for seed in (1, 2, 3)]
+    >>> estimate(pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])).round(3)
+      method        task  env_steps  mean  standard_error  seeds
+    0      a  walker-run          0  20.0           5.774      3
+    """
+    groups = seed_curves.dropna(subset="return_mean").groupby(["method", "task", "env_steps"], sort=True)
+    return groups["return_mean"].agg(mean="mean", standard_error="sem", seeds="count").reset_index()
+
+
+def add_interval(estimates: pd.DataFrame) -> pd.DataFrame:
+    r"""Adds ``std`` :math:`\hat\sigma = \hat s \sqrt N`, and ``lower``, ``upper`` :math:`= \hat\mu \mp 1.96 \hat s`.
+
+    All three are NaN where the standard error is unknown (thesis A.1.2, "Per-task learning curves").
+
+    Args:
+        estimates (DataFrame): any number of rows.
+    """
+    half = Z_95 * estimates["standard_error"]
+    return estimates.assign(
+        std=estimates["standard_error"] * np.sqrt(estimates["seeds"]),
+        lower=estimates["mean"] - half,
+        upper=estimates["mean"] + half,
+    )
+
+
+def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
+    """The estimates of every method and task on a grid of steps: linear in between, NaN outside of a curve.
+
+    The standard error is interpolated like the mean, which is exact if the errors of neighbouring evaluations are
+    perfectly correlated and too large otherwise. ``seeds`` is the smaller count of the two neighbours.
+
+    Args:
+        estimates (DataFrame): any number of rows.
+        grid (array): env steps, increasing.
+
+    Returns:
+        DataFrame: estimates at the steps of the grid.
+    """
+    grid = np.asarray(grid, dtype=float)
+    tables = []
+    for (method, task), curve in estimates.groupby(["method", "task"], sort=False):
+        curve = curve.sort_values("env_steps")
+        columns = {
+            name: np.interp(grid, curve["env_steps"], curve[name], left=np.nan, right=np.nan)
+            for name in ("mean", "standard_error")
+        }
+        steps, seeds = curve["env_steps"].to_numpy(float), curve["seeds"].to_numpy(float)
+        after = np.clip(np.searchsorted(steps, grid), 0, len(steps) - 1)
+        before = np.clip(np.searchsorted(steps, grid, side="right") - 1, 0, len(steps) - 1)
+        columns["seeds"] = np.where(np.isnan(columns["mean"]), np.nan, np.fmin(seeds[before], seeds[after]))
+        tables.append(pd.DataFrame({"method": method, "task": task, "env_steps": grid, **columns}))
+    if not tables:
+        return estimates.iloc[:0]
+    return pd.concat(tables, ignore_index=True)
+
+
+def shared_grid(estimates: pd.DataFrame, budget: float, step: float) -> np.ndarray:
+    """Multiples of ``step`` from the first checkpoint that all methods have to the budget (thesis A.1.2, "AUC").
+
+    A method's first checkpoint is the earliest over its tasks, so that one late curve leaves that cell out and not the
+    start of everybody's.
+
+    Args:
+        estimates (DataFrame): the compared methods.
+        budget (float): env steps.
+        step (float): env steps.
+
+    Raises:
+        ValueError: if no more than one grid point is left.
+
+    >>> curves = pd.DataFrame({"method": ["a", "a", "b"], "task": "x", "env_steps": [0, 50_000, 90_000]})
+    >>> shared_grid(curves, 300_000, 100_000)
+    array([100000., 200000., 300000.])
+    """
+    first = estimates.groupby("method")["env_steps"].min().max() if len(estimates) else np.nan
+    grid = np.arange(np.ceil(first / step), np.floor(budget / step) + 1) * step if first <= budget else np.empty(0)
+    if len(grid) < 2:
+        raise ValueError(
+            f"the grid needs at least two steps of {step:g} env steps between the first checkpoint of all methods "
+            f"({first:g}) and the budget ({budget:g}); use a smaller grid step or a larger budget."
+        )
+    if grid[-1] != budget:
+        raise ValueError(f"the budget must be a multiple of the grid step, got {budget:g} and {step:g} env steps.")
+    return grid
+
+
+def normalisers(estimates: pd.DataFrame, budget: float, method: str = NORMALISER) -> pd.Series:
+    """The constants :math:`c_i`: the method's mean return on each task at the budget (thesis A.1.2).
+
+    Args:
+        estimates (DataFrame): holds curves of ``method``.
+        budget (float): env steps.
+        method (str): by default BMPC.
+
+    Returns:
+        Series: index task; without the tasks on which the method has no value at the budget.
+    """
+    table = interpolate(estimates[estimates["method"] == method], np.array([budget]))
+    return table.dropna(subset="mean").set_index("task")["mean"].astype(float)
+
+
+def normalise(table: pd.DataFrame, constants: pd.Series) -> pd.DataFrame:
+    r"""Divides values and standard errors by the task's constant, :math:`\tilde\mu = \hat\mu / c_i` (thesis A.1.2).
+
+    The constant is treated as fixed: its own uncertainty does not enter. Tasks without one become NaN.
+
+    Args:
+        table (DataFrame): estimates, seed curves or areas.
+        constants (Series): index task, see :func:`normalisers`.
+    """
+    scale = table["task"].map(constants)
+    columns = [name for name in ("mean", "standard_error", "return_mean", "auc", "std") if name in table]
+    return table.assign(**{name: table[name] / scale for name in columns})
+
+
+def aggregate(estimates: pd.DataFrame, tasks: list[str] | tuple[str, ...]) -> pd.DataFrame:
+    r"""Mean over tasks with the standard error of independent tasks.
+
+    .. math:: \tilde\mu_t = \frac1T \sum_i \tilde\mu_{i,t}, \quad
+        \tilde s_t = \frac1T \sqrt{\textstyle\sum_i \tilde s_{i,t}^2}
+
+    (thesis A.1.2, "Aggregate normalized learning curves"). NaN at a step where one of the tasks has no value.
+
+    Args:
+        estimates (DataFrame): normalised, all methods at the same steps (:func:`interpolate`).
+        tasks (sequence of str): the T tasks.
+
+    Returns:
+        DataFrame: ``method, env_steps, mean, standard_error, seeds``; ``seeds`` is the smallest count of a task.
+
+    >>> rows = [("a", "x", 0, 1.0, 0.3, 3), ("a", "y", 0, 2.0, 0.4, 5)]
+    >>> columns = ["method", "task", "env_steps", "mean", "standard_error", "seeds"]
+    >>> aggregate(pd.DataFrame(rows, columns=columns), ["x", "y"])
+      method  env_steps  mean  standard_error  seeds
+    0      a          0   1.5            0.25      3
+    """
+    chosen = estimates[estimates["task"].isin(tasks)]
+    groups = chosen.groupby(["method", "env_steps"], sort=False)
+    table = pd.DataFrame(
+        {
+            "mean": groups["mean"].agg(lambda values: values.sum(skipna=False) / len(tasks)),
+            "standard_error": groups["standard_error"].agg(
+                lambda errors: np.sqrt(np.square(errors).sum(skipna=False)) / len(tasks)
+            ),
+            "seeds": groups["seeds"].min(),
+        }
+    )
+    complete = groups["mean"].count() == len(tasks)
+    return table.where(complete).reset_index().astype({"seeds": table["seeds"].dtype if complete.all() else float})
+
+
+def auc(table: pd.DataFrame) -> pd.DataFrame:
+    """Area under each curve by the trapezoid rule, env steps in millions (thesis A.1.2, "Area under the curve").
+
+    Args:
+        table (DataFrame): estimates on a shared grid (:func:`interpolate`); a curve with a NaN has the area NaN.
+
+    Returns:
+        DataFrame: ``method, task, auc, seeds``, without ``task`` for aggregates.
+
+    >>> curve = pd.DataFrame({"method": "a", "task": "x", "env_steps": [0, 1e5, 2e5], "mean": 0.5, "seeds": 3})
+    >>> auc(curve)
+      method task  auc  seeds
+    0      a    x  0.1      3
+    """
+    key = [name for name in ("method", "task") if name in table]
+    rows = []
+    for names, curve in table.groupby(key, sort=False):
+        curve = curve.sort_values("env_steps")
+        area = np.trapezoid(curve["mean"], curve["env_steps"] / 1e6)
+        rows.append((*names, area, curve["seeds"].min()))
+    return pd.DataFrame(rows, columns=[*key, "auc", "seeds"])
+
+
+def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
+    """Standard error of the mean over seeds of their areas (thesis D.1: areas per seed, then their mean).
+
+    NaN for one seed, and where a seed's own curve does not cover the grid.
+
+    Args:
+        seed_curves (DataFrame): normalised or not.
+        grid (array): env steps.
+
+    Returns:
+        DataFrame: ``method, task, standard_error``.
+    """
+    curves = seed_curves.dropna(subset="return_mean").assign(
+        task=lambda table: list(zip(table["task"], table["seed"], strict=True)), seeds=1, standard_error=np.nan
+    )
+    areas = auc(interpolate(curves.rename(columns={"return_mean": "mean"}), grid))
+    areas["task"] = [task for task, _ in areas["task"]]
+    groups = areas.groupby(["method", "task"], sort=False)["auc"]
+    return groups.agg(lambda values: values.std(skipna=False) / np.sqrt(len(values))).rename("standard_error").reset_index()

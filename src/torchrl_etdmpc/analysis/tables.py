@@ -1,0 +1,78 @@
+"""Result tables in the layout of the thesis (appendix C): one row per task, one column per method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+AGGREGATE = "Normalized aggregate"
+
+
+def result_table(values: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str], column: str) -> pd.DataFrame:
+    """Spreads one value per method and task over a table of tasks and methods.
+
+    Args:
+        values (DataFrame): ``method, task`` and ``column``; the task :data:`AGGREGATE` is the last row.
+        tasks (sequence of str): rows, in this order.
+        methods (sequence of str): columns, in this order.
+        column (str): which value.
+
+    Returns:
+        DataFrame: index ``task``, columns ``methods``, NaN where a value is unavailable.
+    """
+    wide = values.pivot(index="task", columns="method", values=column)
+    return wide.reindex(index=[*tasks, AGGREGATE], columns=list(methods))
+
+
+def rank_methods(table: pd.DataFrame) -> pd.DataFrame:
+    """The best and the second best method of every row; missing where there is none. Ties go to the first column.
+
+    Returns:
+        DataFrame: index ``task``, columns ``best, second_best``.
+
+    >>> rank_methods(pd.DataFrame({"a": [1.0], "b": [3.0], "c": [2.0]}, index=["walker-run"]))
+               best second_best
+    walker-run    b           c
+    """
+    rows = []
+    for _, row in table.iterrows():
+        order = list(row.dropna().sort_values(ascending=False, kind="stable").index)
+        rows.append((order + [None, None])[:2])
+    return pd.DataFrame(rows, index=table.index, columns=["best", "second_best"])
+
+
+def to_csv(table: pd.DataFrame, seeds: pd.DataFrame, errors: pd.DataFrame) -> str:
+    """The table as CSV: task, a column per method, best and second best, then standard errors and numbers of seeds.
+
+    Args:
+        table, seeds, errors (DataFrame): of the same shape, see :func:`result_table`.
+    """
+    parts = [table, rank_methods(table)]
+    parts += [errors.add_suffix(" standard_error"), seeds.add_suffix(" seeds")]
+    return pd.concat(parts, axis=1).rename_axis("task").to_csv(float_format="%.6g", lineterminator="\n")
+
+
+def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, int] | int) -> str:
+    """The table as Markdown: best bold, second best in italics, the number of seeds in brackets.
+
+    Args:
+        table, seeds (DataFrame): of the same shape; a dash marks an unavailable value, a question mark an unknown
+            number of seeds.
+        digits (int or dict): decimals, of every row or by task.
+    """
+    ranks = rank_methods(table)
+    lines = ["| task | " + " | ".join(table.columns) + " |", "|---" * (1 + len(table.columns)) + "|"]
+    for task, row in table.iterrows():
+        decimals = digits if isinstance(digits, int) else digits.get(task, digits[AGGREGATE])
+        cells = []
+        for method, value in row.items():
+            if np.isnan(value):
+                cells.append("–")
+                continue
+            mark = {ranks.loc[task, "best"]: "**", ranks.loc[task, "second_best"]: "*"}.get(method, "")
+            count = seeds.loc[task, method]
+            cells.append(f"{mark}{value:.{decimals}f}{mark} ({'?' if np.isnan(count) else int(count)})")
+        lines.append(f"| {task} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
