@@ -14,9 +14,10 @@ except ImportError as error:
     ) from error
 
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS, HUMANOIDBENCH_HARD, Benchmark, benchmark_of, get_benchmark
+from torchrl_etdmpc.analysis.comparison import Comparison, compare, merge_estimates
 from torchrl_etdmpc.analysis.curves import find_runs, read_curves, read_run, read_runs
 from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves
-from torchrl_etdmpc.analysis.report import Comparison, compare, merge_estimates, write_report
+from torchrl_etdmpc.analysis.report import write_report
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
 from torchrl_etdmpc.analysis.statistics import (
     add_interval,
@@ -27,6 +28,7 @@ from torchrl_etdmpc.analysis.statistics import (
     interpolate,
     normalise,
     normalisers,
+    seed_estimates,
     shared_grid,
 )
 from torchrl_etdmpc.analysis.tables import AGGREGATE, rank_methods, result_table, to_csv, to_markdown
@@ -65,6 +67,7 @@ __all__ = [
     "read_runs",
     "result_table",
     "scores_at",
+    "seed_estimates",
     "shared_grid",
     "to_csv",
     "to_markdown",

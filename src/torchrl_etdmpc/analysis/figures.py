@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
-from torchrl_etdmpc.analysis.statistics import add_interval
+from torchrl_etdmpc.analysis.statistics import Z_95, add_interval, interpolate
 
 # The palette of Okabe and Ito, which people with any colour vision tell apart. Published baselines keep their colour in
 # every report; the rest goes to the runs in their order.
@@ -48,20 +49,31 @@ def plot_curves(estimates: pd.DataFrame, *, tasks: Sequence[str], methods: Seque
     """
     columns = min(len(tasks), 4 if len(tasks) > 4 else 2)
     rows = -(-len(tasks) // columns)
-    figure = Figure(figsize=(max(3.1 * columns, 4.5), 2.4 * rows + 0.6), layout="constrained")
+    figure = Figure(figsize=(max(3.1 * columns, 4.5), 2.4 * rows + 0.8), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     styles = method_styles(methods)
-    for axis, task in zip(axes.flat, tasks, strict=False):
+    for place, (axis, task) in enumerate(zip(axes.flat, tasks, strict=False)):
         for method in methods:
             curve = estimates[(estimates["task"] == task) & (estimates["method"] == method)]
-            _line(axis, curve, method, styles[method])
+            _line(axis, curve, styles[method], budget)
+            here = curve[curve["env_steps"] <= budget]
+            axis.plot(
+                here["env_steps"],
+                here["mean"],
+                color=styles[method]["color"],
+                marker=styles[method]["marker"],
+                linestyle="none",
+                markersize=3,
+            )
         axis.set_title(task, fontsize=10)
         _dress(axis, budget)
+        if place + columns >= len(tasks):
+            axis.set_xlabel("environment steps", fontsize=9)
+        if place % columns == 0:
+            axis.set_ylabel("episode return", fontsize=9)
     for axis in axes.flat[len(tasks) :]:
         axis.remove()
-    figure.supxlabel("environment steps", fontsize=10)
-    figure.supylabel("episode return", fontsize=10)
-    _legend(figure, axes.flat[0])
+    _legend(figure, methods, styles, columns=5 if columns > 1 else 3)
     return figure
 
 
@@ -78,11 +90,12 @@ def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: 
     axis = figure.subplots()
     styles = method_styles(methods)
     for method in methods:
-        _line(axis, aggregates[aggregates["method"] == method], method, styles[method])
+        curve = aggregates[aggregates["method"] == method].assign(task="aggregate")
+        _line(axis, curve, styles[method], budget)
     _dress(axis, budget)
     axis.set_xlabel("environment steps")
     axis.set_ylabel(ylabel)
-    _legend(figure, axis)
+    _legend(figure, methods, styles, columns=3)
     return figure
 
 
@@ -102,7 +115,7 @@ def plot_auc(areas: pd.DataFrame, *, methods: Sequence[str], ylabel: str) -> Fig
         if np.isnan(row["auc"]):
             axis.text(place, 0, " unavailable", rotation=90, ha="center", va="bottom", fontsize=8, color="0.4")
             continue
-        half = 1.96 * row["standard_error"]
+        half = Z_95 * row["standard_error"]
         axis.bar(place, row["auc"], color=styles[method]["color"], width=0.7)
         if not np.isnan(half):
             axis.errorbar(place, row["auc"], yerr=half, color="black", capsize=3, linewidth=1)
@@ -114,21 +127,29 @@ def plot_auc(areas: pd.DataFrame, *, methods: Sequence[str], ylabel: str) -> Fig
     return figure
 
 
-def _line(axis, curve: pd.DataFrame, method: str, style: dict[str, str]) -> None:
-    curve = add_interval(curve.dropna(subset="mean")).sort_values("env_steps")
-    axis.plot(curve["env_steps"], curve["mean"], label=method, linewidth=1.5, markersize=2.5, **style)
+def _line(axis, curve: pd.DataFrame, style: dict[str, str], budget: float) -> None:
+    """The curve up to the budget, with its interval; no marker where nothing was evaluated."""
+    curve = curve.dropna(subset="mean")
+    if curve.empty:
+        return
+    steps = curve["env_steps"].to_numpy(float)
+    curve = add_interval(interpolate(curve, np.union1d(steps[steps <= budget], [budget])).dropna(subset="mean"))
+    axis.plot(curve["env_steps"], curve["mean"], color=style["color"], linestyle=style["linestyle"], linewidth=1.5)
     axis.fill_between(curve["env_steps"], curve["lower"], curve["upper"], color=style["color"], alpha=0.18, linewidth=0)
 
 
 def _dress(axis, budget: float) -> None:
     axis.set_xlim(0, budget * 1.02)
-    axis.margins(y=0.05)
+    axis.autoscale(axis="y")
+    low, high = axis.get_ylim()
+    axis.set_ylim(low if low < -0.1 * high else 0, high)
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.grid(linewidth=0.5, alpha=0.4)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=8)
 
 
-def _legend(figure: Figure, axis) -> None:
-    handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5), frameon=False, fontsize=9)
+def _legend(figure: Figure, methods: Sequence[str], styles: dict[str, dict[str, str]], *, columns: int) -> None:
+    handles = [Line2D([], [], linewidth=1.5, markersize=4, label=method, **styles[method]) for method in methods]
+    columns = min(len(methods), columns)
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)

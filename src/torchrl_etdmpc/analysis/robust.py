@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from torchrl_etdmpc.analysis.statistics import interpolate
+from torchrl_etdmpc.analysis.statistics import interpolate, seed_estimates
 
 
 class Interval(NamedTuple):
@@ -33,14 +33,9 @@ def scores_at(seed_curves: pd.DataFrame, method: str, env_steps: float) -> dict[
         method (str): whose runs.
         env_steps (float): where the scores are read, linear between two evaluations of a run.
     """
-    curves = seed_curves[seed_curves["method"] == method].dropna(subset="return_mean")
-    scores: dict[str, np.ndarray] = {}
-    for task, runs in curves.groupby("task", sort=False):
-        runs = runs.assign(task=runs["seed"], mean=runs["return_mean"], standard_error=np.nan, seeds=1)
-        values = interpolate(runs, np.array([env_steps]))["mean"].dropna()
-        if len(values):
-            scores[str(task)] = values.to_numpy(float)
-    return scores
+    curves = seed_estimates(seed_curves[seed_curves["method"] == method])
+    values = interpolate(curves, np.array([float(env_steps)])).dropna(subset="mean")
+    return {str(task): rows["mean"].to_numpy(float) for task, rows in values.groupby("task", sort=False)}
 
 
 def interquartile_mean(scores: Mapping[str, Sequence[float]], *, resamples: int = 2000, seed: int = 0) -> Interval:

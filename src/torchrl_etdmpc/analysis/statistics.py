@@ -55,13 +55,13 @@ def add_interval(estimates: pd.DataFrame) -> pd.DataFrame:
 
 
 def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
-    """The estimates of every method and task on a grid of steps: linear in between, NaN outside of a curve.
+    """Every curve on a grid of steps: linear in between, NaN outside of the curve.
 
     The standard error is interpolated like the mean, which is exact if the errors of neighbouring evaluations are
     perfectly correlated and too large otherwise. ``seeds`` is the smaller count of the two neighbours.
 
     Args:
-        estimates (DataFrame): any number of rows.
+        estimates (DataFrame): one curve per method and task, and per seed if there is such a column.
         grid (array): env steps, increasing.
 
     Returns:
@@ -69,7 +69,8 @@ def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
     """
     grid = np.asarray(grid, dtype=float)
     tables = []
-    for (method, task), curve in estimates.groupby(["method", "task"], sort=False):
+    key = _curve_key(estimates)
+    for names, curve in estimates.groupby(key, sort=False):
         curve = curve.sort_values("env_steps")
         columns = {
             name: np.interp(grid, curve["env_steps"], curve[name], left=np.nan, right=np.nan)
@@ -79,7 +80,7 @@ def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
         after = np.clip(np.searchsorted(steps, grid), 0, len(steps) - 1)
         before = np.clip(np.searchsorted(steps, grid, side="right") - 1, 0, len(steps) - 1)
         columns["seeds"] = np.where(np.isnan(columns["mean"]), np.nan, np.fmin(seeds[before], seeds[after]))
-        tables.append(pd.DataFrame({"method": method, "task": task, "env_steps": grid, **columns}))
+        tables.append(pd.DataFrame({**dict(zip(key, names, strict=True)), "env_steps": grid, **columns}))
     if not tables:
         return estimates.iloc[:0]
     return pd.concat(tables, ignore_index=True)
@@ -187,14 +188,14 @@ def auc(table: pd.DataFrame) -> pd.DataFrame:
         table (DataFrame): estimates on a shared grid (:func:`interpolate`); a curve with a NaN has the area NaN.
 
     Returns:
-        DataFrame: ``method, task, auc, seeds``, without ``task`` for aggregates.
+        DataFrame: ``method, task, auc, seeds``, with ``seed`` if the curves have it.
 
     >>> curve = pd.DataFrame({"method": "a", "task": "x", "env_steps": [0, 1e5, 2e5], "mean": 0.5, "seeds": 3})
     >>> auc(curve)
       method task  auc  seeds
     0      a    x  0.1      3
     """
-    key = [name for name in ("method", "task") if name in table]
+    key = _curve_key(table)
     rows = []
     for names, curve in table.groupby(key, sort=False):
         curve = curve.sort_values("env_steps")
@@ -215,10 +216,21 @@ def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray) -> pd.DataFr
     Returns:
         DataFrame: ``method, task, standard_error``.
     """
-    curves = seed_curves.dropna(subset="return_mean").assign(
-        task=lambda table: list(zip(table["task"], table["seed"], strict=True)), seeds=1, standard_error=np.nan
-    )
-    areas = auc(interpolate(curves.rename(columns={"return_mean": "mean"}), grid))
-    areas["task"] = [task for task, _ in areas["task"]]
+    areas = auc(interpolate(seed_estimates(seed_curves), grid))
     groups = areas.groupby(["method", "task"], sort=False)["auc"]
-    return groups.agg(lambda values: values.std(skipna=False) / np.sqrt(len(values))).rename("standard_error").reset_index()
+    errors = groups.agg(lambda values: values.std(skipna=False) / np.sqrt(len(values)))
+    return errors.rename("standard_error").reset_index()
+
+
+def seed_estimates(seed_curves: pd.DataFrame) -> pd.DataFrame:
+    """The curve of each seed as an estimate from one seed, for :func:`interpolate` and :func:`auc`.
+
+    Args:
+        seed_curves (DataFrame): ``method, task, seed, env_steps, return_mean``; NaN returns are left out.
+    """
+    curves = seed_curves.dropna(subset="return_mean").rename(columns={"return_mean": "mean"})
+    return curves.assign(standard_error=np.nan, seeds=1)
+
+
+def _curve_key(table: pd.DataFrame) -> list[str]:
+    return [name for name in ("method", "task", "seed") if name in table]

@@ -47,7 +47,9 @@ def to_csv(table: pd.DataFrame, seeds: pd.DataFrame, errors: pd.DataFrame) -> st
     """The table as CSV: task, a column per method, best and second best, then standard errors and numbers of seeds.
 
     Args:
-        table, seeds, errors (DataFrame): of the same shape, see :func:`result_table`.
+        table (DataFrame): see :func:`result_table`.
+        seeds (DataFrame): of the same shape.
+        errors (DataFrame): of the same shape.
     """
     parts = [table, rank_methods(table)]
     parts += [errors.add_suffix(" standard_error"), seeds.add_suffix(" seeds")]
@@ -58,8 +60,8 @@ def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, i
     """The table as Markdown: best bold, second best in italics, the number of seeds in brackets.
 
     Args:
-        table, seeds (DataFrame): of the same shape; a dash marks an unavailable value, a question mark an unknown
-            number of seeds.
+        table (DataFrame): see :func:`result_table`; a dash marks an unavailable value.
+        seeds (DataFrame): of the same shape; a question mark stands for an unknown number.
         digits (int or dict): decimals, of every row or by task.
     """
     ranks = rank_methods(table)
