@@ -26,6 +26,7 @@ from torchrl_etdmpc.analysis import (  # noqa: E402
     compare,
     find_runs,
     get_benchmark,
+    join_curves,
     read_curves,
     read_runs,
     write_report,
@@ -72,7 +73,7 @@ def read(arguments: argparse.Namespace) -> tuple[pd.DataFrame, list[pd.DataFrame
     for argument in arguments.runs:
         name, path = named(argument)
         groups.setdefault(name, []).append(path)
-    runs = pd.concat([read_runs(paths, method=name) for name, paths in groups.items()], ignore_index=True)
+    runs = join_curves(read_runs(paths, method=name) for name, paths in groups.items())
     return runs, [read_curves(file) for file in arguments.reference]
 
 
@@ -99,8 +100,8 @@ def report(arguments: argparse.Namespace) -> str:
         (seeds if "return_mean" in table else means).append(known)
     baselines = [name for name in dict.fromkeys(name for table in means + seeds[1:] for name in table["method"])]
     comparison = compare(
-        pd.concat(seeds, ignore_index=True),
-        pd.concat(means, ignore_index=True) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"]),
+        join_curves(seeds),
+        join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"]),
         benchmark=benchmark,
         tasks=tasks,
         methods=(*methods, *baselines),

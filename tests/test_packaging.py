@@ -24,7 +24,7 @@ _MAY_IMPORT = {
     "objectives": {"functional", "modules"},
     "replay": {"functional", "modules"},
     "collectors": {"functional", "modules", "envs", "replay"},
-    "analysis": set(),
+    "analysis": {"envs"},  # the names of the tasks
     "training": {"functional", "modules", "envs", "planners", "objectives", "replay", "collectors", "analysis"},
     "testing": {"functional", "modules", "envs", "planners", "objectives", "replay", "collectors", "training"},
 }
@@ -119,7 +119,7 @@ def _canonical(name: str) -> str:
 def test_the_pins_satisfy_the_declared_ranges_of_everything_that_the_commands_need():
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    declared = [*project["dependencies"], *extras["dmc"], *extras["train"], *extras["test"], *extras["tensorboard"]]
+    declared = [*project["dependencies"], *extras["dmc"], *extras["train"], *extras["analysis"], *extras["test"], *extras["tensorboard"]]
     pins = _pins()
     for requirement in map(Requirement, declared):
         name = _canonical(requirement.name)

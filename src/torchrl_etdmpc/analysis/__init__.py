@@ -15,7 +15,7 @@ except ImportError as error:
 
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS, HUMANOIDBENCH_HARD, Benchmark, benchmark_of, get_benchmark
 from torchrl_etdmpc.analysis.comparison import Comparison, compare, merge_estimates
-from torchrl_etdmpc.analysis.curves import find_runs, read_curves, read_run, read_runs
+from torchrl_etdmpc.analysis.curves import find_runs, join_curves, read_curves, read_run, read_runs
 from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves
 from torchrl_etdmpc.analysis.report import write_report
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
@@ -53,6 +53,7 @@ __all__ = [
     "get_benchmark",
     "interpolate",
     "interquartile_mean",
+    "join_curves",
     "merge_estimates",
     "method_styles",
     "normalise",

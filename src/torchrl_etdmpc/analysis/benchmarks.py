@@ -93,6 +93,8 @@ def benchmark_of(tasks: Iterable[str]) -> Benchmark:
             nearest = difflib.get_close_matches(str(task), known, n=3)
             hint = f"did you mean {', '.join(nearest)}?" if nearest else f"choose tasks of {', '.join(BENCHMARKS)}."
             raise ValueError(f"unknown task {task!r}; {hint}")
+    if not found:
+        raise ValueError("tasks must hold at least one name, got none.")
     if len(found) > 1:
         examples = ", ".join(f"{task} is of {name}" for name, task in found.items())
         raise ValueError(f"tasks of several benchmarks: {examples}; name the benchmark that you want.")

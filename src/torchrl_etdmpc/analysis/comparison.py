@@ -103,9 +103,7 @@ def compare(
     methods = tuple(methods or dict.fromkeys([*seed_curves["method"], *means["method"]]))
     estimates = estimates[estimates["method"].isin(methods)]
     seed_curves = seed_curves[seed_curves["task"].isin(tasks) & seed_curves["method"].isin(methods)]
-    grid = shared_grid(estimates, budget, grid_step)
-    if start is not None:
-        grid = np.arange(start, budget + 1, grid_step, dtype=float)
+    grid = shared_grid(estimates, budget, grid_step, start=start)
 
     on_grid = normalise(interpolate(estimates, grid), constants)
     errors = auc_standard_error(normalise(seed_curves, constants), grid)
@@ -137,12 +135,10 @@ def _notes(
     missing = int(seed_curves["return_mean"].isna().sum())
     if missing:
         yield f"{missing} evaluation{'s' * (missing > 1)} with a return that is not a number: left out."
-    single = estimates[estimates["seeds"] == 1][["method", "task"]].drop_duplicates()
-    for method, rows in single.groupby("method", sort=False):
+    counts = estimates.groupby(["method", "task"], sort=False)["seeds"].agg(["min", "max"]).reset_index()
+    for method, rows in counts[counts["max"] == 1].groupby("method", sort=False):
         yield f"{method}: one seed on {', '.join(rows['task'])}; a mean of one run, no interval."
-    counts = estimates.groupby(["method", "task"])["seeds"].agg(["min", "max"])
-    varying = counts[counts["min"] != counts["max"]].reset_index()
-    for method, rows in varying.groupby("method", sort=False):
+    for method, rows in counts[counts["min"] < counts["max"]].groupby("method", sort=False):
         where = ", ".join(rows["task"])
         yield f"{method}: not all seeds have every evaluation on {where}; each mean is of those that have it."
     unknown = [name for name in methods if areas[areas["method"] == name]["standard_error"].isna().all()]

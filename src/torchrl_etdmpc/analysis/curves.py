@@ -11,9 +11,11 @@ from __future__ import annotations
 import io
 import json
 import os
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -72,9 +74,9 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
     table = table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
     return pd.DataFrame(
         {
-            "method": method or str(header["preset"]),
-            "task": str(header["task"]),
-            "seed": int(header["seed"]),
+            "method": method or header["preset"],
+            "task": header["task"],
+            "seed": header["seed"],
             "env_steps": table["env_steps"].astype(float),
             "return_mean": table["return_mean"].astype(float),
         }
@@ -141,6 +143,29 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
     return table[list(columns)].sort_values(key, ignore_index=True)
 
 
+def join_curves(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """Joins seed curves, or estimates, of different files.
+
+    Args:
+        tables: all of one kind, at least one.
+
+    Raises:
+        ValueError: if two of them hold the same curve: it would count twice.
+    """
+    seen: set[tuple] = set()
+    joined = []
+    for table in tables:
+        key = [name for name in ("method", "task", "seed") if name in table]
+        curves = set(table[key].itertuples(index=False, name=None))
+        if curves & seen:
+            double = min(curves & seen, key=str)
+            where = " ".join([f"{double[0]} on {double[1]}", *(f"with seed {seed}" for seed in double[2:])])
+            raise ValueError(f"{where} is there twice; leave one out, or give one of them a name of its own.")
+        seen |= curves
+        joined.append(table)
+    return pd.concat(joined, ignore_index=True)
+
+
 def _header(run_dir: Path) -> dict[str, object]:
     """Task, preset and seed of a run."""
     for name in ("config.yaml", "summary.json"):
@@ -151,15 +176,21 @@ def _header(run_dir: Path) -> dict[str, object]:
     text = (run_dir / name).read_text(encoding="utf-8", errors="replace")
     try:
         values = json.loads(text) if name == "summary.json" else yaml.safe_load(text)
-        return {key: values[key] for key in ("task", "preset", "seed")}
+        header = {key: values[key] for key in ("task", "preset", "seed")}
     except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
         raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed.") from error
+    kinds = {"task": str, "preset": str, "seed": int}
+    if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
+        raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed, but {header}.")
+    return header
 
 
 def _parse(text: str, file: Path, columns: tuple[str, ...], *, empty: bool = False) -> pd.DataFrame:
     try:
-        table = pd.read_csv(io.StringIO(text))
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
+            table = pd.read_csv(io.StringIO(text), index_col=False)
+    except (ValueError, pd.errors.ParserWarning) as error:
         if empty and not text.strip():
             return pd.DataFrame(columns=list(columns), dtype=float)
         raise ValueError(f"{file} is not a CSV file with a header line ({' '.join(str(error).split())}).") from error
@@ -171,6 +202,9 @@ def _parse(text: str, file: Path, columns: tuple[str, ...], *, empty: bool = Fal
     missing = [name for name in columns if name not in table]
     if missing:
         raise ValueError(f"{file} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}.")
+    for name in ("method", "task"):
+        if name in columns and table[name].isna().any():
+            raise ValueError(f"{file}: every row needs a {name}.")
     _numbers(table, [name for name in ("env_steps", "return_mean") if name in columns], file)
     return table
 
@@ -182,6 +216,8 @@ def _numbers(table: pd.DataFrame, columns: list[str], file: Path) -> None:
             table[name] = pd.to_numeric(table[name]).astype(float)
         except (ValueError, TypeError) as error:
             raise ValueError(f"{file}: column {name} must hold numbers ({' '.join(str(error).split())}).") from error
+        if np.isinf(table[name]).any():
+            raise ValueError(f"{file}: column {name} must hold finite numbers.")
     steps = table["env_steps"]
     if steps.isna().any() or (steps < 0).any():
         raise ValueError(f"{file}: every row needs env_steps of at least 0.")
@@ -191,6 +227,7 @@ def _check_units(table: pd.DataFrame, file: Path) -> None:
     """Refuses steps that are not environment steps."""
     if "decision_steps" not in table:
         return
+    _numbers(table, ["decision_steps"], file)
     repeat = table["task"].map(_ACTION_REPEAT)
     wrong = table[repeat.notna() & (table["env_steps"] != table["decision_steps"] * repeat)]
     if len(wrong):

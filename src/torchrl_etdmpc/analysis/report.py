@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Literal
 
+import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -49,10 +50,14 @@ def write_report(
             (Path(folder) / name).write_text(text, encoding="utf-8")
         for name, figure in figures.items():
             for ending in filter(None, ("png", vector)):
-                figure.savefig(Path(folder) / f"{name}.{ending}", dpi=160, metadata=_undated(ending))
+                with matplotlib.rc_context({"svg.hashsalt": name}):  # its ids are random otherwise
+                    figure.savefig(Path(folder) / f"{name}.{ending}", dpi=160, metadata=_undated(ending))
         out.mkdir(exist_ok=True)
         for file in sorted(Path(folder).iterdir()):
             os.replace(file, out / file.name)
+        for ending in {"pdf", "svg"} - {vector}:  # of an earlier report, of other data
+            for name in figures:
+                (out / f"{name}.{ending}").unlink(missing_ok=True)
     return out / "index.md"
 
 

@@ -98,6 +98,8 @@ def probability_of_improvement(
 
 def _bootstrap(statistic: Callable[..., np.ndarray], samples: list, resamples: int, seed: int) -> Interval:
     samples = [np.asarray(sample, dtype=float) for sample in samples]
+    if not all(map(len, samples)):
+        raise ValueError("every task needs at least one score.")
     value = float(statistic(*samples))
     if min(map(len, samples)) < 2:
         return Interval(value, np.nan, np.nan)

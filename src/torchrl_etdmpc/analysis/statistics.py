@@ -86,7 +86,7 @@ def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def shared_grid(estimates: pd.DataFrame, budget: float, step: float) -> np.ndarray:
+def shared_grid(estimates: pd.DataFrame, budget: float, step: float, *, start: float | None = None) -> np.ndarray:
     """Multiples of ``step`` from the first checkpoint that all methods have to the budget (thesis A.1.2, "AUC").
 
     A method's first checkpoint is the earliest over its tasks, so that one late curve leaves that cell out and not the
@@ -96,6 +96,7 @@ def shared_grid(estimates: pd.DataFrame, budget: float, step: float) -> np.ndarr
         estimates (DataFrame): the compared methods.
         budget (float): env steps.
         step (float): env steps.
+        start (float, optional): first point, instead of that checkpoint.
 
     Raises:
         ValueError: if no more than one grid point is left.
@@ -104,7 +105,12 @@ def shared_grid(estimates: pd.DataFrame, budget: float, step: float) -> np.ndarr
     >>> shared_grid(curves, 300_000, 100_000)
     array([100000., 200000., 300000.])
     """
-    first = estimates.groupby("method")["env_steps"].min().max() if len(estimates) else np.nan
+    if start is not None:
+        first = start
+        if start % step:
+            raise ValueError(f"the grid must start at a multiple of its step, got {start:g} and {step:g} env steps.")
+    else:
+        first = estimates.groupby("method")["env_steps"].min().max() if len(estimates) else np.nan
     grid = np.arange(np.ceil(first / step), np.floor(budget / step) + 1) * step if first <= budget else np.empty(0)
     if len(grid) < 2:
         raise ValueError(

@@ -65,7 +65,8 @@ def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, i
         digits (int or dict): decimals, of every row or by task.
     """
     ranks = rank_methods(table)
-    lines = ["| task | " + " | ".join(table.columns) + " |", "|---" * (1 + len(table.columns)) + "|"]
+    names = [str(name).replace("|", "\\|") for name in table.columns]
+    lines = ["| task | " + " | ".join(names) + " |", "|---" * (1 + len(table.columns)) + "|"]
     for task, row in table.iterrows():
         decimals = digits if isinstance(digits, int) else digits.get(task, digits[AGGREGATE])
         cells = []

@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("pandas")
+
+import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
+
+from torchrl_etdmpc.analysis import AGGREGATE, Comparison, compare, get_benchmark, merge_estimates  # noqa: E402
+
+EASY = get_benchmark("dmc-easy")  # budget 200,000
+TASKS = ("walker-walk", "walker-run")
+STEPS = (0, 50_000, 100_000, 150_000, 200_000)
+FINAL = {"walker-walk": 800.0, "walker-run": 400.0}  # of BMPC
+
+
+def seed_curves(
+    method: str, value: Callable[[int, str, int], float], *, seeds=(1, 2, 3), steps=STEPS, tasks=TASKS
+) -> pd.DataFrame:
+    rows = [(method, task, seed, step, value(seed, task, step)) for task in tasks for seed in seeds for step in steps]
+    return pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])
+
+
+def means(method: str, value: Callable[[str, int], float], *, steps=STEPS, tasks=TASKS, error=np.nan, seeds=np.nan):
+    rows = [(method, task, step, value(task, step), error, seeds) for task in tasks for step in steps]
+    return pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"])
+
+
+def ours(seed: int, task: str, step: int) -> float:
+    return seed * step / 1000 + len(task)
+
+
+BMPC = means("BMPC", lambda task, step: FINAL[task] * step / 200_000, error=2.0, seeds=5)
+OURS = seed_curves("ours", ours)
+NO_SEEDS, NO_MEANS = OURS.iloc[:0], BMPC.iloc[:0]
+
+
+def run(seeds: pd.DataFrame = OURS, published: pd.DataFrame = BMPC, **options) -> Comparison:
+    return compare(seeds, published, **{"benchmark": EASY, "tasks": TASKS, "grid_step": 50_000} | options)
+
+
+def cell(table: pd.DataFrame, method: str, task: str) -> pd.Series:
+    (row,) = table[(table["method"] == method) & (table["task"] == task)].to_dict("records")
+    return pd.Series(row)
+
+
+def numbers(comparison: Comparison) -> list[pd.DataFrame]:
+    return [
+        t.set_index(["task", "method"]).sort_index().sort_index(axis=1) for t in (comparison.areas, comparison.finals)
+    ]
+
+
+def test_the_normaliser_ends_at_one_and_a_straight_line_to_it_has_half_the_length_as_its_area():
+    comparison = run()
+    assert comparison.constants.to_dict() == FINAL
+    assert cell(comparison.finals, "BMPC", AGGREGATE)["mean"] == pytest.approx(1)
+    for task in (*TASKS, AGGREGATE):
+        assert cell(comparison.areas, "BMPC", task)["auc"] == pytest.approx(0.2 / 2)
+
+
+def test_every_number_of_a_small_comparison_by_hand():
+    comparison = run()
+    scores, areas = {}, {}
+    for task, final in FINAL.items():
+        ends = np.array([ours(seed, task, 200_000) for seed in (1, 2, 3)])
+        starts = np.array([ours(seed, task, 0) for seed in (1, 2, 3)])
+        areas[task], scores[task] = 0.2 * (starts + ends) / 2 / final, ends  # straight lines
+        row = cell(comparison.finals, "ours", task)
+        assert row["mean"] == pytest.approx(ends.mean())
+        assert row["standard_error"] == pytest.approx(ends.std(ddof=1) / 3**0.5)
+        row = cell(comparison.areas, "ours", task)
+        assert row["auc"] == pytest.approx(areas[task].mean())
+        assert row["standard_error"] == pytest.approx(areas[task].std(ddof=1) / 3**0.5)
+        assert row["seeds"] == 3
+    row = cell(comparison.areas, "ours", AGGREGATE)
+    assert row["auc"] == pytest.approx(np.mean([area.mean() for area in areas.values()]))
+    spread = [area.std(ddof=1) / 3**0.5 for area in areas.values()]
+    assert row["standard_error"] == pytest.approx(np.hypot(*spread) / 2)
+    row = cell(comparison.finals, "ours", AGGREGATE)
+    assert row["mean"] == pytest.approx(np.mean([scores[task].mean() / FINAL[task] for task in TASKS]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_rows_and_tasks_and_the_names_of_seeds_change_no_number(seed):
+    expected = numbers(run())
+    renamed = OURS.assign(seed=OURS["seed"].map({1: 9, 2: 4, 3: 6}))
+    tables = [table.sample(frac=1, random_state=seed, ignore_index=True) for table in (renamed, BMPC)]
+    for one, other in zip(numbers(run(*tables, tasks=TASKS[::-1])), expected, strict=True):
+        pd.testing.assert_frame_equal(one, other, check_dtype=False)
+
+
+def test_methods_and_tasks_come_in_the_order_that_was_asked_for_or_that_of_the_tables():
+    assert run().methods == ("ours", "BMPC")
+    assert run(methods=("BMPC", "ours")).methods == ("BMPC", "ours")
+    assert run().tasks == TASKS
+    assert run(tasks=None).tasks == EASY.tasks
+    assert set(run(methods=("ours",)).areas["method"]) == {"ours"}
+
+
+def test_leaving_the_normaliser_out_of_the_columns_does_not_change_the_others():
+    for task in (*TASKS, AGGREGATE):
+        pd.testing.assert_series_equal(
+            cell(run(methods=("ours",)).areas, "ours", task), cell(run().areas, "ours", task)
+        )
+
+
+def test_seed_curves_win_over_means_of_the_same_method_on_the_same_task_only():
+    published = means("ours", lambda task, step: -1.0, error=7.0, seeds=9)
+    merged = merge_estimates(seed_curves("ours", ours, tasks=("walker-run",)), pd.concat([published, BMPC]))
+    by_task = merged[merged["method"] == "ours"].groupby("task")
+    assert by_task["seeds"].unique().map(list).to_dict() == {"walker-run": [3], "walker-walk": [9]}
+    assert by_task.size().to_dict() == dict.fromkeys(TASKS, len(STEPS))
+    assert (by_task.get_group("walker-walk")["mean"] == -1).all()
+    expected = [np.mean([ours(seed, "walker-run", step) for seed in (1, 2, 3)]) for step in STEPS]
+    assert by_task.get_group("walker-run")["mean"].tolist() == expected
+    assert len(merged[merged["method"] == "BMPC"]) == len(BMPC)
+
+
+def test_means_alone_can_be_compared():
+    comparison = run(NO_SEEDS, pd.concat([BMPC, BMPC.assign(method="half", mean=BMPC["mean"] / 2)]))
+    assert cell(comparison.areas, "half", AGGREGATE)["auc"] == pytest.approx(0.05)
+    assert np.isnan(cell(comparison.areas, "half", AGGREGATE)["standard_error"])
+    assert cell(comparison.finals, "half", AGGREGATE)["standard_error"] == pytest.approx(np.hypot(2 / 800, 2 / 400) / 2)
+
+
+def test_seed_curves_alone_can_be_compared():
+    comparison = run(pd.concat([OURS, seed_curves("BMPC", lambda seed, task, step: FINAL[task])]), NO_MEANS)
+    assert cell(comparison.areas, "BMPC", AGGREGATE)["auc"] == pytest.approx(0.2)
+    assert cell(comparison.areas, "BMPC", AGGREGATE)["standard_error"] == pytest.approx(0)
+
+
+def test_methods_with_other_checkpoints_meet_on_the_shared_grid():
+    line = lambda seed, task, step: FINAL[task] * step / 200_000  # noqa: E731
+    odd = seed_curves("odd", line, steps=(0, 30_000, 170_000, 300_000))
+    comparison = run(pd.concat([OURS, odd]))
+    np.testing.assert_array_equal(comparison.grid, STEPS)
+    assert cell(comparison.areas, "odd", AGGREGATE)["auc"] == pytest.approx(0.1)
+    assert cell(comparison.finals, "odd", AGGREGATE)["mean"] == pytest.approx(1)
+    assert any(note.startswith("odd: not evaluated at 200,000 env steps") for note in comparison.notes)
+
+
+def test_seeds_with_other_checkpoints_than_each_other_have_their_own_areas():
+    one, other = (seed_curves("odd", lambda *_: 400.0, seeds=(n,), steps=s) for n, s in ((1, STEPS), (2, (0, 2e5))))
+    comparison = run(pd.concat([OURS, one, other]))
+    assert cell(comparison.areas, "odd", "walker-run")["auc"] == pytest.approx(0.2)
+    assert cell(comparison.areas, "odd", "walker-run")["standard_error"] == pytest.approx(0)
+    assert cell(comparison.areas, "odd", "walker-run")["seeds"] == 1  # in between only one of them was evaluated
+
+
+def test_the_grid_starts_where_all_methods_have_begun():
+    late = seed_curves("late", lambda *_: 1.0, steps=(60_000, 200_000))
+    np.testing.assert_array_equal(run(pd.concat([OURS, late])).grid, [100_000, 150_000, 200_000])
+
+
+def test_a_run_that_ends_early_is_unavailable_there_and_in_the_aggregate_and_a_note_says_so():
+    short = [seed_curves("short", ours, tasks=TASKS[:1]), seed_curves("short", ours, tasks=TASKS[1:], steps=STEPS[:4])]
+    comparison = run(pd.concat([OURS, *short]))
+    for table, column in ((comparison.areas, "auc"), (comparison.finals, "mean")):
+        values = {task: cell(table, "short", task)[column] for task in (*TASKS, AGGREGATE)}
+        assert {task: bool(np.isnan(value)) for task, value in values.items()} == {
+            "walker-walk": False,
+            "walker-run": True,
+            AGGREGATE: True,
+        }
+    note = "short ends before 200,000 env steps on walker-run (last evaluation 150,000): unavailable there"
+    assert any(text.startswith(note) for text in comparison.notes)
+
+
+def test_a_task_without_a_curve_is_unavailable_in_the_aggregate_and_a_note_says_so():
+    comparison = run(pd.concat([OURS, seed_curves("part", ours, tasks=TASKS[:1])]))
+    rows = comparison.areas[comparison.areas["method"] == "part"].set_index("task")["auc"]
+    assert np.isfinite(rows["walker-walk"]) and np.isnan(rows[AGGREGATE])
+    assert "part has no curve on walker-run." in comparison.notes
+
+
+def test_a_smaller_budget_still_normalises_by_the_benchmarks():
+    comparison = run(budget=100_000)
+    assert comparison.budget == comparison.grid[-1] == 100_000
+    assert cell(comparison.finals, "BMPC", AGGREGATE)["mean"] == pytest.approx(0.5)
+    assert cell(comparison.areas, "BMPC", AGGREGATE)["auc"] == pytest.approx(0.1 * 0.25)
+
+
+def test_without_the_normaliser_there_are_returns_but_no_areas_and_a_note_says_so():
+    comparison = run(published=NO_MEANS)
+    assert cell(comparison.finals, "ours", "walker-run")["mean"] == pytest.approx(410)
+    assert np.isnan(cell(comparison.finals, "ours", AGGREGATE)["mean"])
+    assert comparison.areas["auc"].isna().all()
+    note = "No return of BMPC to normalise by on walker-walk, walker-run: areas there are unavailable."
+    assert note in comparison.notes
+
+
+def test_tasks_and_methods_of_no_concern_are_left_out():
+    strange = seed_curves("ours", lambda *_: 1e9, tasks=("dog-run", "walker-stand"))
+    for one, other in zip(numbers(run(pd.concat([OURS, strange]))), numbers(run()), strict=True):
+        pd.testing.assert_frame_equal(one, other)
+
+
+def test_what_was_passed_is_not_changed():
+    seeds, published = OURS.copy(), BMPC.copy()
+    run(seeds, published)
+    pd.testing.assert_frame_equal(seeds, OURS)
+    pd.testing.assert_frame_equal(published, BMPC)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"grid_step": 200_000, "tasks": ("walker-run",), "budget": 100_000}, "the grid needs at least two steps"),
+        ({"budget": 130_000}, "the budget must be a multiple of the grid step"),
+        ({"start": 200_000}, "grid"),
+        ({"start": 300_000}, "grid"),
+        ({"start": 30_000}, "grid"),
+    ],
+)
+def test_a_grid_of_one_point_or_one_that_misses_the_budget_is_an_error(options, message):
+    with pytest.raises(ValueError, match=message):
+        run(**options)
+
+
+def test_the_start_of_the_grid_can_be_chosen():
+    comparison = run(start=100_000)
+    np.testing.assert_array_equal(comparison.grid, [100_000, 150_000, 200_000])
+    assert cell(comparison.areas, "BMPC", AGGREGATE)["auc"] == pytest.approx(0.1 * 0.75)
+
+
+def test_a_complete_comparison_needs_no_note_but_that_on_methods_without_seeds():
+    assert run().notes == ("No interval of the AUC for BMPC: it needs the curves of at least two seeds.",)
+
+
+def test_one_seed_has_a_mean_and_no_interval_and_a_note_says_so():
+    comparison = run(seed_curves("ours", ours, seeds=(1,)))
+    for task in (*TASKS, AGGREGATE):
+        assert np.isfinite(cell(comparison.areas, "ours", task)["auc"])
+        assert np.isnan(cell(comparison.areas, "ours", task)["standard_error"])
+        assert np.isnan(cell(comparison.finals, "ours", task)["standard_error"])
+    expected = f"ours: one seed on {', '.join(sorted(TASKS))}; a mean of one run, no interval."
+    assert expected in comparison.notes
+
+
+def test_a_return_that_is_not_a_number_is_left_out_and_counted():
+    broken = OURS.assign(return_mean=OURS["return_mean"].mask((OURS["seed"] == 2) & (OURS["env_steps"] == 200_000)))
+    comparison = run(broken)
+    assert cell(comparison.finals, "ours", "walker-run")["mean"] == pytest.approx(10 + np.mean([200, 600]))
+    assert cell(comparison.finals, "ours", "walker-run")["seeds"] == 2
+    assert "2 evaluations with a return that is not a number: left out." in comparison.notes
+
+
+def test_missing_evaluations_of_a_seed_are_noted():
+    gap = OURS[~((OURS["seed"] == 3) & (OURS["env_steps"] == 50_000) & (OURS["task"] == "walker-run"))]
+    note = "ours: not all seeds have every evaluation on walker-run; each mean is of those that have it."
+    assert note in run(gap).notes
+
+
+def test_a_seed_that_is_behind_does_not_make_it_one_seed():
+    behind = OURS[(OURS["seed"] == 1) | ((OURS["seed"] == 2) & (OURS["env_steps"] < 200_000))]
+    assert not any("one seed" in note for note in run(behind).notes)
+
+
+def test_an_unknown_number_of_seeds_is_not_taken_for_a_varying_one():
+    unknown = means("theirs", lambda task, step: 1.0)
+    assert not any("not all seeds" in note for note in run(published=pd.concat([BMPC, unknown])).notes)

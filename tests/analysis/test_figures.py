@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("pandas")
+
+import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
+from matplotlib.colors import to_hex  # noqa: E402
+from matplotlib.container import BarContainer, ErrorbarContainer  # noqa: E402
+
+from torchrl_etdmpc.analysis import method_styles, plot_aggregate, plot_auc, plot_curves  # noqa: E402
+
+METHODS = ("mine", "other", "BMPC", "SAC")
+TASKS = ("walker-walk", "cup-catch", "walker-run")
+STEPS = np.array([0.0, 40_000.0, 80_000.0, 120_000.0])
+BUDGET = 100_000
+
+
+def estimates(error: float = 5.0, *, methods=METHODS, tasks=TASKS) -> pd.DataFrame:
+    rows = [
+        (method, task, step, 10.0 * place + step / 1000, error, 3)
+        for place, method in enumerate(methods)
+        for task in tasks
+        for step in STEPS
+    ]
+    return pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"])
+
+
+def areas(**values: tuple[float, float]) -> pd.DataFrame:
+    rows = [(method, *pair) for method, pair in values.items()]
+    return pd.DataFrame(rows, columns=["method", "auc", "standard_error"])
+
+
+def curves(table: pd.DataFrame, *, tasks=TASKS, methods=METHODS):
+    return plot_curves(table, tasks=tasks, methods=methods, budget=BUDGET)
+
+
+def drawn_lines(axis) -> list:
+    return [line for line in axis.lines if line.get_linestyle() != "None"]
+
+
+def drawn_markers(axis) -> list:
+    return [line for line in axis.lines if line.get_linestyle() == "None"]
+
+
+def interval_corners(axis) -> np.ndarray:
+    """All corners of all shaded areas."""
+    paths = [path.vertices for shade in axis.collections for path in shade.get_paths()]
+    corners = np.concatenate(paths) if paths else np.empty((0, 2))
+    return corners[np.isfinite(corners).all(-1)]
+
+
+def legend_colors(figure) -> dict[str, str]:
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    return dict(zip(texts, [to_hex(line.get_color()) for line in legend.get_lines()], strict=True))
+
+
+def test_a_method_has_the_same_colour_in_every_figure():
+    expected = {method: style["color"].lower() for method, style in method_styles(METHODS).items()}
+    aggregate = plot_aggregate(estimates(tasks=TASKS[:1]), methods=METHODS, budget=BUDGET, ylabel="y")
+    for figure in (curves(estimates()), aggregate):
+        assert legend_colors(figure) == expected
+        for axis in figure.axes:
+            assert [to_hex(line.get_color()) for line in drawn_lines(axis)] == list(expected.values())
+            assert [to_hex(shade.get_facecolor()[0][:3]) for shade in axis.collections] == list(expected.values())
+    bars = plot_auc(areas(**dict.fromkeys(METHODS, (1.0, 0.1))), methods=METHODS, ylabel="y").axes[0].patches
+    assert [to_hex(bar.get_facecolor()) for bar in bars] == list(expected.values())
+
+
+def test_baselines_keep_their_colour_whatever_stands_beside_them():
+    alone = method_styles(["SAC"])["SAC"]
+    assert method_styles(["x", "BMPC", "SAC", "y"])["SAC"] == alone
+    assert method_styles(["SAC", "x"])["x"] == method_styles(["x"])["x"]
+
+
+def test_sixteen_methods_can_be_told_apart():
+    names = [*(f"run {n}" for n in range(12)), "BMPC", "TD-MPC2", "DreamerV3", "SAC"]
+    looks = {(style["color"], style["linestyle"]) for style in method_styles(names).values()}
+    assert len(looks) == len(names)
+
+
+@pytest.mark.parametrize("tasks", [TASKS, TASKS[::-1], TASKS[:1], (*TASKS, "a", "b", "c", "d", "e")])
+def test_there_is_one_panel_per_task_in_order(tasks):
+    figure = curves(estimates(), tasks=tasks)
+    assert [axis.get_title() for axis in figure.axes] == list(tasks)
+
+
+def test_curves_go_up_to_the_budget_and_markers_stand_at_evaluations_only():
+    for place, axis in enumerate(curves(estimates()).axes):
+        assert len(drawn_lines(axis)) == len(drawn_markers(axis)) == len(METHODS), TASKS[place]
+        for offset, line in enumerate(drawn_lines(axis)):
+            np.testing.assert_allclose(line.get_xdata(), [0, 40_000, 80_000, BUDGET])
+            np.testing.assert_allclose(line.get_ydata(), 10 * offset + np.array([0, 40, 80, 100]))
+        for line in drawn_markers(axis):
+            np.testing.assert_array_equal(line.get_xdata(), STEPS[STEPS <= BUDGET])
+        assert interval_corners(axis)[:, 0].max() == BUDGET
+        low, high = axis.get_xlim()
+        assert low == 0 and BUDGET <= high <= 1.05 * BUDGET
+
+
+def test_a_curve_that_ends_early_is_not_drawn_further():
+    axis = curves(estimates().query("env_steps <= 40_000")).axes[0]
+    assert {line.get_xdata().max() for line in axis.lines} == {40_000}
+
+
+def test_a_curve_that_begins_after_the_budget_has_no_point():
+    axis = curves(estimates().query("env_steps > @BUDGET")).axes[0]
+    assert sum(len(line.get_xdata()) for line in axis.lines) == 0
+    assert len(interval_corners(axis)) == 0
+
+
+def test_the_shaded_interval_is_1_96_standard_errors_to_both_sides():
+    axis = curves(estimates(5.0, methods=METHODS[:1]), methods=METHODS[:1]).axes[0]
+    corners = interval_corners(axis)
+    for step, mean in ((0, 0), (40_000, 40), (80_000, 80), (100_000, 100)):
+        heights = corners[corners[:, 0] == step][:, 1]
+        np.testing.assert_allclose([heights.min(), heights.max()], [mean - 9.8, mean + 9.8])
+
+
+def test_no_interval_is_drawn_where_the_standard_error_is_unknown():
+    aggregate = plot_aggregate(estimates(np.nan, tasks=TASKS[:1]), methods=METHODS, budget=BUDGET, ylabel="y")
+    for figure in (curves(estimates(np.nan)), aggregate):
+        for axis in figure.axes:
+            assert len(interval_corners(axis)) == 0
+            assert all(np.isfinite(line.get_ydata()).all() for line in drawn_lines(axis))
+
+
+def test_an_interval_ends_where_the_standard_error_becomes_unknown():
+    table = estimates(5.0)
+    table = table.assign(standard_error=table["standard_error"].where(table["env_steps"] <= 40_000))
+    for axis in curves(table).axes:
+        assert interval_corners(axis)[:, 0].max() == 40_000
+
+
+def test_a_method_without_a_curve_on_a_task_leaves_the_others_panel_complete():
+    axis = curves(estimates().query("method != 'mine'")).axes[0]
+    assert [to_hex(line.get_color()) for line in drawn_lines(axis)] == [
+        method_styles(METHODS)[name]["color"].lower() for name in METHODS[1:]
+    ]
+
+
+def test_negative_returns_are_within_the_panel():
+    table = estimates()
+    axis = curves(table.assign(mean=table["mean"] - 500)).axes[0]
+    low, high = axis.get_ylim()
+    values = np.concatenate([line.get_ydata() for line in axis.lines])
+    assert low <= values.min() and values.max() <= high
+
+
+def test_bars_are_as_high_as_their_areas_with_1_96_standard_errors():
+    axis = plot_auc(areas(b=(0.5, 0.1), a=(0.25, 0.05)), methods=("a", "b"), ylabel="area").axes[0]
+    assert [bar.get_height() for bar in axis.patches] == [0.25, 0.5]
+    assert [label.get_text() for label in axis.get_xticklabels()] == ["a", "b"]
+    assert axis.get_ylabel() == "area"
+    limits = [c.lines[2][0].get_segments()[0][:, 1] for c in axis.containers if isinstance(c, ErrorbarContainer)]
+    np.testing.assert_allclose(limits, [[0.25 - 0.098, 0.25 + 0.098], [0.5 - 0.196, 0.5 + 0.196]])
+
+
+def test_a_bar_without_standard_error_has_no_whisker():
+    axis = plot_auc(areas(a=(0.5, np.nan), b=(0.5, 0.1)), methods=("a", "b"), ylabel="y").axes[0]
+    assert sum(isinstance(container, ErrorbarContainer) for container in axis.containers) == 1
+    assert sum(isinstance(container, BarContainer) for container in axis.containers) == 2
+
+
+@pytest.mark.parametrize("table", [areas(a=(np.nan, np.nan), b=(0.5, 0.1)), areas(b=(0.5, 0.1))])
+def test_an_unavailable_area_has_the_word_and_no_bar(table):
+    axis = plot_auc(table, methods=("a", "b"), ylabel="y").axes[0]
+    assert [(text.get_text().strip(), text.get_position()[0]) for text in axis.texts] == [("unavailable", 0)]
+    (bar,) = axis.patches
+    assert bar.get_x() < 1 < bar.get_x() + bar.get_width()

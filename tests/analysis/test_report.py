@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("pandas")
+
+import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
+from torchrl_etdmpc.analysis import AGGREGATE, Comparison, compare, get_benchmark, write_report  # noqa: E402
+
+TASKS = ("walker-walk", "walker-run")
+STEPS = (0, 100_000, 200_000)
+TEXTS = {"auc.csv", "auc.md", "final.csv", "final.md", "index.md"}
+FIGURES = {"curves", "aggregate", "auc"}
+FILES = TEXTS | {f"{name}.png" for name in FIGURES}
+
+
+def comparison(*, seeds: int = 2, height: float = 1.0, short: bool = False) -> Comparison:
+    """Ours with some seeds, which may end early on walker-run, beside BMPC's straight lines to 100."""
+    ours = [
+        ("ours", task, seed, step, height * (seed + step / 2000))
+        for task in TASKS
+        for seed in range(seeds)
+        for step in STEPS[: 2 if short and task == "walker-run" else 3]
+    ]
+    bmpc = [("BMPC", task, step, step / 2000, 2.0, 5) for task in TASKS for step in STEPS]
+    return compare(
+        pd.DataFrame(ours, columns=["method", "task", "seed", "env_steps", "return_mean"]),
+        pd.DataFrame(bmpc, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"]),
+        benchmark=get_benchmark("dmc-easy"),
+        tasks=TASKS,
+    )
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def read_table(path: Path) -> dict[str, dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return {row.pop("task"): row for row in csv.DictReader(file)}
+
+
+def links(page: Path) -> list[str]:
+    return re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report with figures as vectors, in a folder whose parents did not exist."""
+    out = tmp_path_factory.mktemp("made") / "some" / "where"
+    assert write_report(comparison(), out, vector="svg") == out / "index.md"
+    return out
+
+
+def test_a_report_is_exactly_its_files_and_nothing_is_left_beside_it(report):
+    assert set(contents(report.parent)) == {
+        f"{report.name}/{name}" for name in FILES | {f"{name}.svg" for name in FIGURES}
+    }
+    assert [path.name for path in report.parent.iterdir()] == [report.name]
+
+
+def test_figures_are_pictures(report):
+    for name in FIGURES:
+        assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert b"<svg" in (report / f"{name}.svg").read_bytes()
+
+
+def test_every_link_of_the_page_exists_and_every_figure_is_on_it(report):
+    found = links(report / "index.md")
+    assert {name for name in found if not (report / name).is_file()} == set()
+    assert {f"{name}.png" for name in FIGURES} <= set(found)
+
+
+def test_the_tables_hold_the_numbers_of_the_comparison(report):
+    areas, finals = read_table(report / "auc.csv"), read_table(report / "final.csv")
+    assert list(areas) == list(finals) == [*TASKS, AGGREGATE]
+    for task in TASKS:
+        # seeds 0 and 1 are BMPC's line and one more: mean 0.5 above, standard error 0.5, over a constant of 100
+        assert float(finals[task]["ours"]) == pytest.approx(100.5)
+        assert float(finals[task]["ours standard_error"]) == pytest.approx(0.5)
+        assert float(areas[task]["ours"]) == pytest.approx(0.2 * 0.505)
+        assert float(areas[task]["ours standard_error"]) == pytest.approx(0.2 * 0.005)
+        assert float(areas[task]["BMPC"]) == pytest.approx(0.1)
+        assert float(finals[task]["ours seeds"]) == 2
+    assert float(finals[AGGREGATE]["ours"]) == pytest.approx(1.005)
+    assert float(areas[AGGREGATE]["ours standard_error"]) == pytest.approx(0.001 / 2**0.5)
+    assert areas[AGGREGATE]["BMPC standard_error"] == ""
+    assert (areas[AGGREGATE]["best"], areas[AGGREGATE]["second_best"]) == ("ours", "BMPC")
+
+
+def test_the_page_holds_both_tables_and_what_the_spread_over_seeds_is(report):
+    page = (report / "index.md").read_text(encoding="utf-8")
+    for name in ("auc.md", "final.md"):
+        assert (report / name).read_text(encoding="utf-8") in page
+    # mean, standard deviation sqrt(1/2), standard error 1/2, and 1.96 of them to both sides
+    assert "| walker-run | ours | 100.5 | 0.7 | 0.5 | 99.5 to 101.5 | 2 |" in page
+    assert "all 21 tasks" not in page
+    assert "2 of its 21 tasks" in page
+
+
+def test_the_same_data_gives_the_same_files_and_a_report_replaces_an_old_one(report, tmp_path):
+    out = tmp_path / "report"
+    write_report(comparison(height=3.0), out)
+    assert set(contents(out)) == FILES
+    old = contents(out)
+    (out / "mine.txt").write_text("stays")
+    write_report(comparison(), out)
+    new = contents(out)
+    assert new.pop("mine.txt") == b"stays"
+    first = contents(report)
+    assert {name: first[name] for name in FILES} == new
+    assert all(new[name] != old[name] for name in FILES)
+
+
+def test_the_same_data_gives_the_same_vector_figures(report, tmp_path):
+    write_report(comparison(), tmp_path / "report", vector="svg")
+    assert contents(tmp_path / "report") == contents(report)
+
+
+@pytest.mark.parametrize("which", [1, 3])
+def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_it(monkeypatch, tmp_path, which):
+    out = tmp_path / "report"
+    out.mkdir()
+    for name in FILES:
+        (out / name).write_text("old")
+    calls = []
+
+    def save(figure, path, **options):
+        calls.append(path)
+        if len(calls) == which:
+            raise OSError("disk full")
+        Path(path).write_bytes(b"picture")
+
+    monkeypatch.setattr(Figure, "savefig", save)
+    with pytest.raises(OSError, match="disk full"):
+        write_report(comparison(), out)
+    assert contents(out) == dict.fromkeys(FILES, b"old")
+    assert [path.name for path in tmp_path.iterdir()] == ["report"]
+
+
+def test_a_figure_that_fails_makes_no_report(monkeypatch, tmp_path):
+    def fail(*arguments, **options):
+        raise RuntimeError("no figure today")
+
+    monkeypatch.setattr(Figure, "savefig", fail)
+    with pytest.raises(RuntimeError, match="no figure today"):
+        write_report(comparison(), tmp_path / "report")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page and the tables only, which is much faster."""
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: Path(path).write_bytes(b""))
+
+
+def test_one_seed_is_a_mean_whose_missing_interval_the_page_explains(without_figures, tmp_path):
+    page = write_report(comparison(seeds=1), tmp_path / "report").read_text(encoding="utf-8")
+    assert "- ours: one seed on walker-run, walker-walk; a mean of one run, no interval." in page
+    assert "nan" not in page.lower()
+    row = read_table(tmp_path / "report" / "final.csv")["walker-run"]
+    assert float(row["ours"]) == pytest.approx(100)
+    assert row["ours standard_error"] == ""
+    assert "| walker-run | ours |" not in page  # no row in the table of intervals
+
+
+def test_what_is_unavailable_is_a_dash_on_the_page_empty_in_csv_and_explained(without_figures, tmp_path):
+    page = write_report(comparison(short=True), tmp_path / "report").read_text(encoding="utf-8")
+    for name in ("auc", "final"):
+        table = read_table(tmp_path / "report" / f"{name}.csv")
+        assert [table[task]["ours"] == "" for task in (*TASKS, AGGREGATE)] == [False, True, True]
+        lines = (tmp_path / "report" / f"{name}.md").read_text(encoding="utf-8").splitlines()
+        assert [line.split("|")[2].strip() == "–" for line in lines[2:]] == [False, True, True]
+    assert "- ours ends before 200,000 env steps on walker-run (last evaluation 100,000): unavailable there" in page
+    assert "nan" not in page.lower()
+
+
+def test_methods_known_per_seed_on_all_tasks_have_an_interquartile_mean_on_the_page(without_figures, tmp_path):
+    page = write_report(comparison(seeds=2), tmp_path / "report").read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| ours \| ([\d.]+) \(([\d.]+) to ([\d.]+)\) \|  \| 2 \|$", page, re.MULTILINE)
+    assert np.array(row, float) == pytest.approx([1.005, 1.0, 1.01])
+    assert "Interquartile mean" not in write_report(comparison(short=True), tmp_path / "other").read_text("utf-8")

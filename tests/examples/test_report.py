@@ -1,0 +1,349 @@
+from __future__ import annotations
+
+import csv
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("pandas")
+pytest.importorskip("scipy")
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = ROOT / "examples" / "report.py"
+HEADER = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes\n"
+PER_SEED = "method,task,seed,env_steps,return_mean\n"
+FILES = {"auc.csv", "auc.md", "final.csv", "final.md", "index.md", "curves.png", "aggregate.png", "auc.png"}
+# Evaluations at 0 and 100,000 env steps: the number of the seed with 00 and with 50 behind it.
+ROWS = "".join(f"{steps},{steps // 2},7,1.0,{{seed}}{steps // 2000:02d},0.5,10\n" for steps in (0, 100_000))
+
+
+def make_run(
+    path: str, *, task: str = "walker-walk", preset: str = "cpu", seed: int = 1, text: str | None = None
+) -> Path:
+    run = Path(path)
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(f"task: {task}\npreset: {preset}\nseed: {seed}\n")
+    (run / "eval.csv").write_text(HEADER + ROWS.format(seed=seed) if text is None else text)
+    return run
+
+
+def make_baseline(path: str = "baseline.csv", *, method: str = "BMPC") -> str:
+    rows = [f"{method},walker-walk,{steps},{steps / 2000},1.0,5\n" for steps in (0, 10_000, 20_000, 100_000, 200_000)]
+    Path(path).write_text("method,task,env_steps,mean,standard_error,seeds\n" + "".join(rows))
+    return path
+
+
+def read_table(path: Path) -> dict[str, dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return {row.pop("task"): row for row in csv.DictReader(file)}
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", "disable")  # the script sets it where it is not set; this restores it
+
+
+@pytest.fixture
+def run_main(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs the command in this process."""
+
+    def run(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+
+    return run
+
+
+@pytest.fixture
+def refused(run_main: Callable[..., None], capfd: pytest.CaptureFixture) -> Callable[..., str]:
+    """Runs the command, which must fail with one line and no report; returns the line without "error: "."""
+
+    def run(*arguments: str) -> str:
+        before = {path for path in Path().rglob("*")}
+        with pytest.raises(SystemExit) as caught:
+            run_main(*arguments)
+        assert isinstance(caught.value.code, str)  # Python prints it on stderr and exits with 1
+        assert capfd.readouterr() == ("", "")
+        assert set(Path().rglob("*")) == before
+        (line,) = caught.value.code.splitlines()
+        assert line.startswith("error: ")
+        return line.removeprefix("error: ")
+
+    return run
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    """The command as a process of its own that can be interrupted, also where this one ignores interrupts."""
+    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with open("stdout", "w") as out, open("stderr", "w") as err:
+            return subprocess.Popen(
+                [sys.executable, str(SCRIPT), *arguments], env=environment, stdout=out, stderr=err, text=True
+            )
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def test_one_command_in_an_empty_folder_compares_runs_with_the_published_baselines(tmp_path):
+    for seed in (1, 2):
+        make_run(
+            f"runs/{seed}", seed=seed, text=HEADER + ROWS.format(seed=seed) + f"200000,100000,7,1.0,{seed}00,0,1\n"
+        )
+    process = start("runs")
+    assert process.wait(timeout=600) == 0, Path("stderr").read_text()
+    assert Path("stderr").read_text() == ""
+    closing = "2 runs on 1 task of Easy DMC, up to 200,000 env steps; the report is report/index.md\n"
+    assert Path("stdout").read_text() == closing
+    assert {path.name for path in Path("report").iterdir()} == FILES
+    row = read_table(Path("report", "final.csv"))["walker-walk"]
+    assert float(row["cpu"]) == 150
+    assert float(row["cpu standard_error"]) == pytest.approx(50)
+    assert {"BMPC", "TD-MPC2", "SAC", "DreamerV3"} < set(row)
+    assert float(read_table(Path("report", "final.csv"))["Normalized aggregate"]["BMPC"]) == 1
+
+
+def test_a_path_that_does_not_exist_is_one_line_on_stderr_of_the_real_command(tmp_path):
+    process = start("nowhere", "--out", "made")
+    assert process.wait(timeout=600) == 1
+    assert Path("stderr").read_text() == "error: no such run directory: nowhere.\n"
+    assert Path("stdout").read_text() == ""
+    assert not Path("made").exists()
+
+
+def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_interrupt(tmp_path):
+    row = lambda steps, value: f"{steps},{steps // 2},7,1.0,{value},0.5,10\n"  # noqa: E731
+    run = make_run("runs/one", text=HEADER + row(0, 1.0) + row(10_000, 5.0))
+    options = ("--budget", "20000", "--grid-step", "10000", "--reference", make_baseline(), "--watch", "0.5")
+    process = start("runs", *options)
+
+    def wait_for_reports(count: int) -> list[str]:
+        deadline = time.monotonic() + 300
+        while len(lines := Path("stdout").read_text().splitlines()) < count:
+            assert process.poll() is None, Path("stderr").read_text()
+            assert time.monotonic() < deadline, "the report does not follow the run"
+            time.sleep(0.1)
+        assert len(lines) == count
+        return lines
+
+    try:
+        assert "1 run on 1 task of Easy DMC, up to 10,000 env steps" in wait_for_reports(1)[0]
+        assert read_table(Path("report", "final.csv"))["walker-walk"]["cpu"] == ""
+        half, rest = row(20_000, 77.5)[:-11], row(20_000, 77.5)[-11:]
+        assert half.endswith(",7")
+        with (run / "eval.csv").open("a") as file:
+            file.write(half)
+        assert "up to 10,000 env steps" in wait_for_reports(2)[1]
+        assert read_table(Path("report", "final.csv"))["walker-walk"]["cpu"] == ""
+        with (run / "eval.csv").open("a") as file:
+            file.write(rest)
+        assert "up to 20,000 env steps" in wait_for_reports(3)[2]
+        assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 77.5
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
+        process.wait()
+    assert Path("stderr").read_text() == ""
+    assert {path.name for path in Path("report").iterdir()} == FILES
+    assert not list(Path().glob(".report*"))
+
+
+def test_names_make_methods_of_folders_and_options_are_obeyed(run_main, capfd):
+    for name in ("a", "b"):
+        make_run(f"runs/{name}")
+    make_run("runs/=c", preset="utd4")  # a path that exists is a path, whatever it is called
+    options = ("--budget", "100000", "--grid-step", "50000", "--vector", "pdf", "--out", "deep/er")
+    run_main("first=runs/a", "runs/=c", "second=runs/b", "--reference", make_baseline(), *options)
+    out, err = capfd.readouterr()
+    assert out == "3 runs on 1 task of Easy DMC, up to 100,000 env steps; the report is deep/er/index.md\n"
+    assert err == ""
+    pdfs = {"curves.pdf", "aggregate.pdf", "auc.pdf"}
+    assert {path.name for path in Path("deep", "er").iterdir()} == FILES | pdfs
+    header = Path("deep", "er", "auc.md").read_text().splitlines()[0]
+    assert header == "| task | first | utd4 | second | BMPC |"
+    assert "Evaluation grid of the AUC: 0 to 100,000 every 50,000" in Path("deep", "er", "index.md").read_text()
+
+
+def test_without_baselines_all_tasks_of_a_named_benchmark_are_rows(run_main, capfd):
+    make_run("runs/walker")
+    make_run("runs/dog", task="dog-run")
+    run_main("runs", "--benchmark", "dmc-hard", "--all-tasks", "--budget", "100000", "--reference")
+    assert capfd.readouterr().out.startswith("1 run on 7 tasks of Hard DMC")
+    table = read_table(Path("report", "final.csv"))
+    assert len(table) == 7 + 1
+    assert float(table["dog-run"]["cpu"]) == 150  # the one at 100,000 env steps
+    assert "No return of BMPC to normalise by on" in Path("report", "index.md").read_text()
+
+
+def test_a_path_that_does_not_exist_is_refused(refused):
+    make_run("runs/a")
+    assert refused("runs/a", "runs/b") == "no such run directory: runs/b."
+    assert refused("mine=runs/b") == "no such run directory: runs/b."
+
+
+def test_a_folder_without_runs_is_refused(refused):
+    Path("runs", "empty").mkdir(parents=True)
+    assert refused("runs").startswith("no runs found in runs;")
+
+
+def test_an_unknown_task_is_refused(refused):
+    make_run("runs/a", task="walker-wlak")
+    assert refused("runs").startswith("unknown task 'walker-wlak'; did you mean walker-walk")
+    assert "unknown task 'walker-wlak'" in refused("runs", "--benchmark", "dmc-easy")
+
+
+def test_an_unknown_benchmark_is_refused_with_the_names_of_those_there_are(refused):
+    make_run("runs/a")
+    message = refused("runs", "--benchmark", "atari")
+    assert message == "unknown benchmark 'atari'; choose one of dmc-easy, dmc-hard, humanoidbench-hard."
+
+
+def test_runs_of_two_benchmarks_are_refused_without_the_name_of_one(refused):
+    make_run("runs/a")
+    make_run("runs/b", task="dog-run")
+    assert "walker-walk is of dmc-easy, dog-run is of dmc-hard" in refused("runs")
+
+
+def test_a_benchmark_of_none_of_the_runs_is_refused(refused):
+    make_run("runs/a")
+    assert refused("runs", "--benchmark", "dmc-hard") == "no run on a task of dmc-hard; the runs are on walker-walk."
+
+
+@pytest.mark.parametrize("text", ["", HEADER, HEADER.strip()])
+def test_runs_that_have_not_evaluated_yet_are_refused(refused, text):
+    make_run("runs/a", text=text)
+    assert refused("runs").startswith("no evaluation in any of the runs yet")
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (HEADER + "1000,1000,1,1,1,1,1\n", "mixes units"),
+        ("decision_steps,return_mean\n0,1\n", "counts decision_steps only"),
+        ("env_steps,updates\n0,1\n", "lacks the column return_mean"),
+        ("\0\1\2\n\3\n", "eval.csv"),
+    ],
+)
+def test_a_run_whose_table_is_not_one_is_refused(refused, text, message):
+    run = make_run("runs/a", text=text)
+    assert message in (error := refused("runs"))
+    assert str(run / "eval.csv") in error
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (b"", "is not a CSV file"),
+        (bytes(range(256)) * 8, "mine.csv"),
+        (b"method,task,mean\n", "lacks the column env_steps"),
+        (PER_SEED.encode() + b"a,walker-walk,1,0,1\n" * 2, "two rows for method=a"),
+        (b"method,task,decision_steps,mean\na,walker-walk,0,1\n", "counts decision_steps only"),
+        (b"method,task,env_steps,decision_steps,mean\na,walker-walk,5,5,1\n", "mixes units"),
+    ],
+)
+def test_a_baseline_that_is_not_one_is_refused(refused, content, message):
+    make_run("runs/a")
+    Path("mine.csv").write_bytes(content)
+    assert message in (error := refused("runs", "--reference", "mine.csv"))
+    assert "mine.csv" in error
+
+
+def test_a_baseline_that_does_not_exist_is_refused(refused):
+    make_run("runs/a")
+    assert refused("runs", "--reference", "mine.csv") == "no such file of learning curves: mine.csv."
+
+
+def test_the_same_method_task_and_seed_twice_is_refused(refused):
+    make_run("runs/a")
+    make_run("runs/b")
+    assert refused("runs") == (
+        "two runs of cpu on walker-walk with seed 1: runs/a and runs/b; leave one out, or give one of them a name of "
+        "its own."
+    )
+
+
+def test_the_same_method_task_and_seed_twice_is_refused_where_the_name_of_one_is_given(refused):
+    make_run("runs/a")
+    make_run("runs/b")
+    assert "two runs of cpu on walker-walk with seed 1" in refused("runs/a", "cpu=runs/b", "--reference")
+
+
+def test_a_seed_in_two_baseline_files_does_not_count_twice(refused):
+    make_run("runs/a")
+    for name in ("one.csv", "two.csv"):
+        Path(name).write_text(
+            PER_SEED + "".join(f"x,walker-walk,{seed},{t},{seed}\n" for seed in (1, 2) for t in (0, 200_000))
+        )
+    assert "walker-walk" in refused("runs", "--reference", "one.csv", "two.csv")
+
+
+def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
+    make_run("runs/a", preset="BMPC")
+    message = "BMPC names both runs and a baseline; give the runs another name (NAME=PATH)."
+    assert refused("runs") == message
+    assert refused("runs", "--reference", make_baseline()) == message
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--grid-step", "-5"), "--grid-step must be positive, got -5."),
+        (("--grid-step", "0"), "--grid-step must be positive, got 0."),
+        (("--budget", "-1"), "--budget must be positive, got -1."),
+        (("--watch", "0"), "--watch must be positive, got 0."),
+        (("--grid-step", "300000"), "the grid needs at least two steps"),
+        (("--budget", "150000"), "the budget must be a multiple of the grid step"),
+    ],
+)
+def test_an_option_that_makes_no_sense_is_refused(refused, arguments, message):
+    make_run("runs/a")
+    assert refused("runs", *arguments).startswith(message)
+
+
+def test_a_run_without_configuration_and_summary_is_refused(refused):
+    (make_run("runs/a") / "config.yaml").unlink()
+    assert refused("runs") == "runs/a has neither config.yaml nor summary.json, which name its task and seed."
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[unclosed",
+        "",
+        "task: walker-walk\n",
+        "task: walker-walk\npreset: cpu\nseed:\n",
+        "task: [walker-walk]\npreset: cpu\nseed: 1\n",
+    ],
+)
+def test_a_broken_configuration_is_refused(refused, text):
+    (make_run("runs/a") / "config.yaml").write_text(text)
+    assert refused("runs") == "runs/a/config.yaml does not give the run's task, preset and seed."
+
+
+def test_an_output_that_is_a_file_is_refused_and_stays(refused):
+    make_run("runs/a")
+    Path("report").write_text("mine")
+    assert "report" in refused("runs", "--reference", make_baseline(), "--budget", "100000")
+    assert Path("report").read_text() == "mine"
+
+
+def test_the_line_on_the_terminal_names_what_was_compared(run_main, capfd):
+    make_run("runs/a", task="cup-catch")
+    make_run("runs/b")
+    make_run("runs/c", seed=2)
+    run_main("runs", "--budget", "100000", "--reference")
+    line = "3 runs on 2 tasks of Easy DMC, up to 100,000 env steps; the report is report/index.md\n"
+    assert re.fullmatch(re.escape(line), capfd.readouterr().out)
