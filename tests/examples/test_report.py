@@ -278,7 +278,7 @@ def test_the_same_method_task_and_seed_twice_is_refused(refused):
 def test_the_same_method_task_and_seed_twice_is_refused_where_the_name_of_one_is_given(refused):
     make_run("runs/a")
     make_run("runs/b")
-    assert "two runs of cpu on walker-walk with seed 1" in refused("runs/a", "cpu=runs/b", "--reference")
+    assert "two curves of cpu on walker-walk with seed 1" in refused("runs/a", "cpu=runs/b", "--reference")
 
 
 def test_a_seed_in_two_baseline_files_does_not_count_twice(refused):

@@ -160,7 +160,7 @@ def join_curves(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
         if curves & seen:
             double = min(curves & seen, key=str)
             where = " ".join([f"{double[0]} on {double[1]}", *(f"with seed {seed}" for seed in double[2:])])
-            raise ValueError(f"{where} is there twice; leave one out, or give one of them a name of its own.")
+            raise ValueError(f"two curves of {where}; leave one out, or give one of them a name of its own.")
         seen |= curves
         joined.append(table)
     return pd.concat(joined, ignore_index=True)
@@ -181,7 +181,7 @@ def _header(run_dir: Path) -> dict[str, object]:
         raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed.") from error
     kinds = {"task": str, "preset": str, "seed": int}
     if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
-        raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed, but {header}.")
+        raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed.")
     return header
 
 
