@@ -119,7 +119,14 @@ def _canonical(name: str) -> str:
 def test_the_pins_satisfy_the_declared_ranges_of_everything_that_the_commands_need():
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    declared = [*project["dependencies"], *extras["dmc"], *extras["train"], *extras["analysis"], *extras["test"], *extras["tensorboard"]]
+    declared = [
+        *project["dependencies"],
+        *extras["dmc"],
+        *extras["train"],
+        *extras["analysis"],
+        *extras["test"],
+        *extras["tensorboard"],
+    ]
     pins = _pins()
     for requirement in map(Requirement, declared):
         name = _canonical(requirement.name)

@@ -156,7 +156,8 @@ def test_the_policy_loss_sends_no_gradient_into_the_observations(make_loss, slic
 
 def test_distillation_detaches_the_latents_that_it_is_given(make_world_model, slices):
     latent = torch.rand(3, 2, 4, 16, requires_grad=True)
-    out = distillation(make_world_model(), latent, *(slices["plan", key].transpose(0, 1) for key in ("loc", "scale")))
+    plan = (slices["plan", key].transpose(0, 1).unsqueeze(1) for key in ("loc", "scale"))
+    out = distillation(make_world_model(), latent, *plan)
     assert out.kl.shape == out.entropy.shape == (3, 2, 4)
     assert torch.autograd.grad(out.kl.sum() + out.entropy.sum(), [latent], allow_unused=True) == (None,)
 

@@ -155,6 +155,7 @@ def test_every_call_samples_new_imagined_actions_even_in_evaluation_mode(make_lo
 def test_a_target_beyond_the_bins_is_classified_in_the_end_bin(make_world_model, bias_bin, decoded):
     world_model = make_world_model()
     predicted = world_model.encode(torch.randn(4, 2, 7, 5))
+    predicted[0] = predicted[0, 0]  # both heads start from the same latent
     rollout = LatentRollout(predicted[:, 0], predicted)
     error = value_error(world_model, rollout, torch.full((3, 7), decoded), dropout=False)
     expected = -world_model.value_head(predicted[:-1]).log_softmax(-1)[..., bias_bin].mean((0, 2))

@@ -51,12 +51,30 @@ class DynamicsEnsemble(MLP):
         """Steps every head once.
 
         Args:
-            latent (Tensor): head i's own latent, shape ``[F, ..., L]`` (or ``[1, ..., L]``: the same for all heads).
+            latent (Tensor): head i's own latent, shape ``[F, ..., L]`` (or ``[1, ..., L]``: the same for all heads). A
+                dimension of size 1 that ``action`` has in full is computed once in the first layer: many actions in
+                one latent.
             action (Tensor): broadcastable to ``[F, ..., A]``.
 
         Returns:
             Tensor: next latents, shape ``[F, ..., L]``.
         """
-        latent = latent.expand(self.num_heads, *latent.shape[1:])
-        action = action.expand(*latent.shape[:-1], action.shape[-1])
-        return super().forward(torch.cat([latent, action], dim=-1))
+        first = self.hidden[0]
+        shape = torch.broadcast_shapes(latent.shape[1:-1], action.shape[max(0, action.ndim - latent.ndim + 1) : -1])
+        if latent.shape[1:-1] == shape:
+            latent = latent.expand(self.num_heads, *latent.shape[1:])
+            action = action.expand(*latent.shape[:-1], action.shape[-1])
+            x = first(torch.cat([latent, action], dim=-1))
+        else:
+            of_latent, of_action = first.weight.split([latent.shape[-1], action.shape[-1]], dim=-2)
+            bias = first.bias.view(-1, *(1,) * len(shape), first.bias.shape[-1])
+            x = first.finish(_product(latent, of_latent) + (_product(action.unsqueeze(0), of_action) + bias))
+        for layer in self.hidden[1:]:
+            x = layer(x)
+        return self.output(x)
+
+
+def _product(x: Tensor, weight: Tensor) -> Tensor:
+    """``[1 or E, ..., in]`` times ``[E, in, out]``: ``[E, ..., out]``."""
+    rows = x.reshape(x.shape[0], -1, x.shape[-1]).expand(weight.shape[0], -1, -1)
+    return torch.bmm(rows, weight).view(weight.shape[0], *x.shape[1:-1], weight.shape[-1])

@@ -101,7 +101,10 @@ class NormedLinear(EnsembleLinear):
 
     def forward(self, x: Tensor, *, dropout: bool = False) -> Tensor:
         """As :meth:`EnsembleLinear.forward`; ``dropout=True`` activates dropout, whatever the training mode."""
-        x = super().forward(x)
+        return self.finish(super().forward(x), dropout=dropout)
+
+    def finish(self, x: Tensor, *, dropout: bool = False) -> Tensor:
+        """What follows the linear map: dropout, LayerNorm and activation, ``[..., out] -> [..., out]``."""
         if dropout and self.dropout:
             x = F.dropout(x, self.dropout, training=True)
         size = (x.shape[-1],)

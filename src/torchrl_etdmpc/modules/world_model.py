@@ -145,7 +145,8 @@ class WorldModel(nn.Module):
         """Steps every dynamics head on its own latent.
 
         Args:
-            latent (Tensor): ``[F, ..., L]``, or ``[1, ..., L]`` where all heads start from the same latent.
+            latent (Tensor): ``[F, ..., L]``, or ``[1, ..., L]`` where all heads start from the same latent; a further
+                dimension of size 1 stands for many actions in one latent.
             action (Tensor): broadcastable to ``[F, ..., A]``.
 
         Returns:

@@ -40,7 +40,8 @@ class LatentRollout(NamedTuple):
     encoded: Tensor
     """Encodings z_0..z_T of the real observations, without gradient, ``[T + 1, B, L]``."""
     predicted: Tensor
-    """Head i's own rollout zhat_0..zhat_T of the replayed actions, with gradient, ``[T + 1, F, B, L]``."""
+    """Head i's own rollout zhat_0..zhat_T of the replayed actions, with gradient, ``[T + 1, F, B, L]``. All heads start
+    from the same zhat_0."""
 
 
 def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
@@ -63,6 +64,26 @@ def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
     for action in slices.action.unbind(0):
         latents.append(world_model.next(latents[-1], action))
     return LatentRollout(torch.cat([first.detach().unsqueeze(0), later]), torch.stack(latents))
+
+
+def distinct(steps: Tensor, num_heads: int | None = None) -> Tensor:
+    """What a network has to be asked about the first T steps of a rollout: step 0, on which the heads agree, only once.
+
+    Args:
+        steps (Tensor): ``[T, F, B, ...]``, or ``[T, B, ...]`` with ``num_heads``: the same for all heads.
+        num_heads (int, optional): F, for an entry without a head dimension.
+
+    Returns:
+        Tensor: ``[1 + (T - 1) F, B, ...]``.
+    """
+    if num_heads is not None:
+        steps = steps.unsqueeze(1).expand(-1, num_heads, *steps.shape[1:])
+    return torch.cat([steps[0, :1], steps[1:].flatten(0, 1)])
+
+
+def mean_over_heads(answers: Tensor, num_heads: int) -> Tensor:
+    """Mean over dynamics heads of what :func:`distinct` asked, ``[1 + (T - 1) F, B]`` to ``[T, B]``."""
+    return torch.cat([answers[:1], answers[1:].unflatten(0, (-1, num_heads)).mean(1)]) if len(answers) > 1 else answers
 
 
 class LatentRolloutLoss(LossModule):

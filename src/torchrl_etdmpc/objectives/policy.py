@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices, distinct, mean_over_heads
 
 KLDirection = Literal["backward", "forward"]
 
@@ -18,9 +18,9 @@ class Distillation(NamedTuple):
     """Divergence from the planner's target and entropy of the policy."""
 
     kl: Tensor
-    """Mean over action dimensions, ``[T, F, B]``."""
+    """Mean over action dimensions, ``[...]``."""
     entropy: Tensor
-    """Entropy of the (unclipped) policy, sum over action dimensions, ``[T, F, B]``."""
+    """Entropy of the (unclipped) policy, sum over action dimensions, ``[...]``."""
 
 
 def distillation(
@@ -37,17 +37,17 @@ def distillation(
 
     Args:
         world_model (WorldModel): the policy.
-        latent (Tensor): latents, detached here, shape ``[T, F, B, L]``.
-        plan_loc (Tensor): mean of the target, shape ``[T, B, A]``.
-        plan_scale (Tensor): standard deviation of the target, shape ``[T, B, A]``.
+        latent (Tensor): latents, detached here, shape ``[..., L]``.
+        plan_loc (Tensor): mean of the target, shape ``[..., A]``.
+        plan_scale (Tensor): standard deviation of the target, shape ``[..., A]``.
         kl_direction (str): ``"backward"`` or ``"forward"``.
 
     Returns:
-        Distillation: KL and entropy, each ``[T, F, B]``.
+        Distillation: KL and entropy, each ``[...]``.
     """
     mean, log_std = world_model.policy(latent.detach())
     policy = (mean, log_std.exp())
-    plan = (plan_loc.unsqueeze(1), plan_scale.unsqueeze(1))
+    plan = (plan_loc, plan_scale)
     kl = gaussian_kl(*policy, *plan) if kl_direction == "backward" else gaussian_kl(*plan, *policy)
     return Distillation(kl.mean(-1), gaussian_entropy(log_std).sum(-1))
 
@@ -132,16 +132,14 @@ def policy_terms(
     loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Term ``[T, B]`` and metrics of the policy, for any loss with a running scale."""
-    kl, entropy = distillation(
-        loss.world_model,
-        rollout.predicted[:-1],
-        slices.plan_loc,
-        slices.plan_scale,
-        kl_direction=loss.kl_direction,
-    )
+    heads = loss.world_model.num_dynamics
+    latent = distinct(rollout.predicted[:-1])
+    plan = distinct(slices.plan_loc, heads), distinct(slices.plan_scale, heads)
+    kl, entropy = distillation(loss.world_model, latent, *plan, kl_direction=loss.kl_direction)
     if loss.training:
         loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau))
     scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
     term = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
-    metrics = {"policy_kl": kl.mean(), "policy_entropy": entropy.mean(), "kl_scale": scale}
-    return {"policy": loss._discount_depth(term.mean(1))}, metrics
+    policy_kl, policy_entropy = (mean_over_heads(value, heads).mean() for value in (kl, entropy))
+    metrics = {"policy_kl": policy_kl, "policy_entropy": policy_entropy, "kl_scale": scale}
+    return {"policy": loss._discount_depth(mean_over_heads(term, heads))}, metrics

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices, distinct, mean_over_heads
 
 
 @torch.no_grad()
@@ -56,8 +56,10 @@ def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor,
     Returns:
         Tensor: mean over value and dynamics heads, shape ``[T, B]``.
     """
-    logits = world_model.value_head(rollout.predicted[:-1], dropout=dropout)  # [V, T, F, B, M]
-    return two_hot_cross_entropy(logits, target.unsqueeze(1), world_model.bins).mean((0, 2))
+    heads = world_model.num_dynamics
+    logits = world_model.value_head(distinct(rollout.predicted[:-1]), dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
+    error = two_hot_cross_entropy(logits, distinct(target, heads), world_model.bins)
+    return mean_over_heads(error.mean(0), heads)
 
 
 class EfficientTDMPCValueLoss(LatentRolloutLoss):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices, distinct, mean_over_heads
 
 
 def consistency_error(rollout: LatentRollout) -> Tensor:
@@ -37,8 +37,10 @@ def reward_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices
     Returns:
         Tensor: mean over heads, shape ``[T, B]``.
     """
-    logits = world_model.reward_head(rollout.predicted[:-1], slices.action.unsqueeze(1))
-    return two_hot_cross_entropy(logits, slices.reward.unsqueeze(1), world_model.bins).mean(1)
+    heads = world_model.num_dynamics
+    logits = world_model.reward_head(distinct(rollout.predicted[:-1]), distinct(slices.action, heads))
+    error = two_hot_cross_entropy(logits, distinct(slices.reward, heads), world_model.bins)
+    return mean_over_heads(error, heads)
 
 
 def termination_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices) -> Tensor:

@@ -305,14 +305,20 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         if self.num_proposals:
             bounds = self.proposal_log_std_bounds
             proposals = propose_sequences(self.world_model, latent, noise.proposals, bounds)
-            proposal_scores, proposal_returns = self._evaluate(latent, proposals)
         steps = []
         for iteration in range(self.iterations):
             actions = sample_sequences(gaussian, noise.candidates[:, iteration])
-            scores, returns = self._evaluate(latent, actions)
-            if self.num_proposals:
+            if not self.num_proposals:
+                scores, returns = self._evaluate(latent, actions)
+            elif iteration == 0:
+                actions = torch.cat([proposals, actions], dim=1)
+                scores, returns = self._evaluate(latent, actions)
+                proposal_scores, proposal_returns = (x[:, : self.num_proposals] for x in (scores, returns))
+            else:  # the proposals keep the scores of the first iteration
+                scores, returns = self._evaluate(latent, actions)
                 actions = torch.cat([proposals, actions], dim=1)
                 scores = torch.cat([proposal_scores, scores], dim=1)
+                returns = torch.cat([proposal_returns, returns], dim=1)
             elites = select_elites(actions, scores, self.num_elites)
             weights = elite_weights(elites.scores, self.inverse_temperature)
             fitted = fit_gaussian(elites.actions, weights, std_min=self.std_min, std_max=self.std_max)
@@ -320,8 +326,6 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             keep = fallback[:, None, None]
             gaussian = Gaussian(*(torch.where(keep, old, new) for old, new in zip(gaussian, fitted, strict=True)))
             if trace:
-                if self.num_proposals:
-                    returns = torch.cat([proposal_returns, returns], dim=1)
                 steps.append(PlanTrace(actions, scores, returns, *gaussian))
 
         loc, value = self._choose(

@@ -56,22 +56,27 @@ def imagined_returns(
     Returns:
         Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for the last depth only.
     """
-    horizon = actions.shape[2]
-    latent = latent[None, :, None].expand(1, -1, actions.shape[1], -1)
-    rewards, values, alive = [], [], []
+    heads, states, horizon = world_model.num_dynamics, actions.shape[0], actions.shape[2]
+    first, latents = latent[None, :, None], []  # at the first step all heads and candidates stand on the same latent
     for step in range(horizon):
-        action = actions[:, :, step]
-        reward = world_model.reward(latent, action)  # at the first step all heads stand on the same latent
-        rewards.append(reward.expand(world_model.num_dynamics, -1, -1))
-        latent = world_model.next(latent, action)
-        if all_depths or step + 1 == horizon:
-            values.append(world_model.values(latent))
-        ended = world_model.termination(latent)
-        if ended is not None:
-            alive.append((1 - ended) * (alive[-1] if alive else 1))
-    return return_table(
-        torch.stack(rewards).permute(2, 3, 0, 1),
-        torch.stack(values).permute(2, 3, 0, 1, 4),
-        discount,
-        torch.stack(alive).permute(2, 3, 0, 1) if alive else None,
+        latents.append(world_model.next(latents[-1] if latents else first, actions[:, :, step]))
+    depths = torch.stack(latents if all_depths else latents[-1:])  # [D, F, B, N, L]
+    values = world_model.values(depths)
+
+    # Rewards of all steps in one call; those of the first step do not depend on the head.
+    steps = actions.permute(2, 0, 1, 3)  # [H, B, N, A]
+    rows = [first[0].expand(states, actions.shape[1], -1).flatten(0, 1)]
+    rows += [later.flatten(0, -2) for later in latents[:-1]]
+    tried = [steps[0].flatten(0, 1), steps[1:].unsqueeze(1).expand(-1, heads, -1, -1, -1).flatten(0, -2)]
+    rewards = world_model.reward(torch.cat(rows), torch.cat(tried))
+    per_step = states * actions.shape[1]
+    rewards = torch.cat(
+        [
+            rewards[:per_step].view(1, 1, *actions.shape[:2]).expand(1, heads, -1, -1),
+            rewards[per_step:].view(horizon - 1, heads, *actions.shape[:2]),
+        ]
     )
+
+    ended = [world_model.termination(latent) for latent in latents]
+    alive = None if ended[0] is None else (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1)
+    return return_table(rewards.permute(2, 3, 0, 1), values.permute(2, 3, 0, 1, 4), discount, alive)

@@ -107,7 +107,8 @@ class AnalyticWorld(nn.Module):
 
     def next(self, latent: Tensor, action: Tensor) -> Tensor:
         """Steps every head: ``[F, ..., L]`` (or ``[1, ..., L]``) and an action to ``[F, ..., L]``."""
-        action = action.expand(*latent.shape[:-1], self.action_dim)
+        shape = torch.broadcast_shapes(latent.shape[:-1], action.shape[:-1])
+        latent, action = latent.expand(*shape, self.latent_dim), action.expand(*shape, self.action_dim)
         drift = nn.functional.pad(self.drift, (0, self.latent_dim - self.observation_dim))
         return self.transition(latent, action) + drift.view(-1, *(1,) * (latent.ndim - 2), self.latent_dim)
 
