@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import warnings
 from typing import Any
 
 import pytest
@@ -20,7 +19,6 @@ from torchrl_etdmpc.training import (
     build_replay,
     build_world_model,
     preset,
-    resolve_compile,
     resolve_device,
 )
 from torchrl_etdmpc.training.config import PlannerConfig, ReanalyzeConfig
@@ -238,24 +236,6 @@ def test_cuda_without_a_device_is_refused(monkeypatch, name):
     assert str(caught.value) == expected
 
 
-@pytest.mark.parametrize(
-    ("setting", "device", "compiler", "mode"),
-    [
-        ("off", "cpu", "g++", None),
-        ("off", "cuda", "g++", None),
-        ("auto", "cpu", "g++", "default"),
-        ("auto", "cpu", "clang++", "default"),
-        ("auto", "cuda", None, "default"),
-        ("default", "cpu", None, "default"),
-    ],
-)
-def test_auto_compiles_where_a_compiler_exists(monkeypatch, setting, device, compiler, mode):
-    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}" if name == compiler else None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert resolve_compile(setting, torch.device(device)) == mode
-
-
 def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compiled):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.warns(UserWarning) as caught:
@@ -266,11 +246,11 @@ def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compil
     assert compiled == []
 
 
-def test_on_a_cpu_the_planners_of_the_training_loop_are_compiled_and_nothing_else(compiled):
+def test_on_a_cpu_the_update_and_the_planners_of_the_training_loop_are_compiled_and_nothing_else(compiled):
     agent = tiny_agent(compile="default")
     owners = [function.__self__ for function, _ in compiled]
-    assert owners == [agent.planner, agent.reanalyze_planner]
-    assert [function.__name__ for function, _ in compiled] == ["plan", "plan"]
+    assert owners == [agent.updater, agent.planner, agent.reanalyze_planner]
+    assert [function.__name__ for function, _ in compiled] == ["_gradients", "plan", "plan"]
     assert all(options == {"mode": "default", "dynamic": False, "fullgraph": True} for _, options in compiled)
 
 

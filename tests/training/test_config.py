@@ -370,7 +370,7 @@ REFUSED = [
         for name in ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every", "threads")
     ),
     ({"device": "tpu"}, "device must be one of auto, cpu, cuda, got 'tpu'."),
-    ({"compile": "max"}, "compile must be one of auto, off, default, got 'max'."),
+    ({"compile": "most"}, "compile must be one of auto, off, default, max, got 'most'."),
     ({"logger": "mlflow"}, "logger must be one of none, tensorboard, wandb, got 'mlflow'."),
 ]
 

@@ -287,7 +287,7 @@ class SeparateSteps:
         policy = torch.distributions.Normal(mean, log_std.exp())
         plan = [batch["plan", name].transpose(0, 1).unsqueeze(1) for name in ("loc", "scale")]
         kl = torch.distributions.kl_divergence(policy, torch.distributions.Normal(*plan)).mean(-1)
-        self.loss.kl_scale.copy_(updated_scale(self.loss.kl_scale, kl[0].detach(), TAU))
+        self.loss.kl_scale.copy_(updated_scale(self.loss.kl_scale, kl[0, 0].detach(), TAU))  # alike for all heads
         term = kl / self.loss.kl_scale - 1e-4 * ACTION_DIM * policy.entropy().sum(-1)
         weights = 0.5 ** torch.arange(len(term), dtype=term.dtype)
         self.policy_optimizer.zero_grad()

@@ -129,11 +129,14 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         policy = ("policy_kl", "policy_entropy", "kl_scale") if self.distill else ()
         return ("consistency_error", "reward_error", *flags, "value_error", "value_target", *policy)
 
-    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        parts = [model_terms, value_terms, *((policy_terms,) if self.distill else ())]
+    def _terms(
+        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        parts = [model_terms(self, slices, rollout), value_terms(self, slices, rollout, target_values)]
+        if self.distill:
+            parts.append(policy_terms(self, slices, rollout))
         terms, metrics = {}, {}
-        for part in parts:
-            part_terms, part_metrics = part(self, slices, rollout)
+        for part_terms, part_metrics in parts:
             terms.update(part_terms)
             metrics.update(part_metrics)
         return terms, metrics

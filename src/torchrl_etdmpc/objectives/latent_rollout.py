@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -217,7 +218,9 @@ class LatentRolloutLoss(LossModule):
         """Names of the detached metrics, in order."""
 
     @abc.abstractmethod
-    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _terms(
+        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Unreduced terms ``[T, B]`` by name, and scalar metrics by name."""
 
     def _key(self, name: str) -> NestedKey:
@@ -246,7 +249,16 @@ class LatentRolloutLoss(LossModule):
     def out_keys(self, keys: list[str]) -> None:
         self._out_keys = keys
 
-    def _slices(self, tensordict: TensorDictBase) -> Slices:
+    def slices(self, tensordict: TensorDictBase) -> Slices:
+        """The entries that this loss reads, time first.
+
+        Args:
+            tensordict (TensorDictBase): batch size [B, T].
+
+        Raises:
+            ValueError: if an entry is not of shape [B, T, features].
+            KeyError: if a key is missing.
+        """
         fields = dict.fromkeys(Slices._fields)
         for name in self._reads:
             value = tensordict.get(self._key(name), None)
@@ -284,15 +296,41 @@ class LatentRolloutLoss(LossModule):
             ValueError: if an entry is not of shape [B, T, features].
             KeyError: if a key is missing.
         """
-        slices = self._slices(tensordict)
-        terms, metrics = self._terms(slices, latent_rollout(self.__dict__["world_model"], slices))
-        out = {
-            f"loss_{name}": getattr(self, f"{name}_coef") * self._reduce_loss(term.transpose(0, 1), tensordict)
-            for name, term in terms.items()
-        }
-        out.update({name: metric.detach() for name, metric in metrics.items()})
-        out = TensorDict(out, batch_size=[])
+
+        def reduce(term: Tensor) -> Tensor:
+            return self._reduce_loss(term.transpose(0, 1), tensordict)
+
+        out = TensorDict(self.evaluate(self.slices(tensordict), self.target_values(), reduce), batch_size=[])
         self._clear_weakrefs(tensordict, out)
+        return out
+
+    def target_values(self) -> dict[str, Tensor] | None:
+        """The target parameters of the value heads by name, or ``None`` if this loss has none."""
+        targets = self._modules.get("target_value_params")
+        if targets is None:
+            return None
+        names = ((name, ".".join((name,) if isinstance(name, str) else name)) for name in targets.keys(True, True))
+        return {dotted: targets.get(name).data for name, dotted in names}
+
+    def evaluate(
+        self,
+        slices: Slices,
+        target_values: dict[str, Tensor] | None,
+        reduce: Callable[[Tensor], Tensor] = torch.mean,
+    ) -> dict[str, Tensor]:
+        """What :meth:`forward` returns, from plain tensors: the part that compiles as one graph.
+
+        Args:
+            slices (Slices): from :meth:`slices`.
+            target_values (dict): from :meth:`target_values`.
+            reduce (callable): a term ``[T, B]`` to a loss. Default: its mean.
+
+        Returns:
+            dict: ``loss_*`` terms weighted by their coefficients, and detached metrics.
+        """
+        terms, metrics = self._terms(slices, latent_rollout(self.__dict__["world_model"], slices), target_values)
+        out = {f"loss_{name}": getattr(self, f"{name}_coef") * reduce(term) for name, term in terms.items()}
+        out.update({name: metric.detach() for name, metric in metrics.items()})
         return out
 
     def _discount_depth(self, error: Tensor) -> Tensor:

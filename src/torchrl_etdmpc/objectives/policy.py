@@ -113,7 +113,9 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
     def _metric_names(self) -> tuple[str, ...]:
         return ("policy_kl", "policy_entropy", "kl_scale")
 
-    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _terms(
+        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         return policy_terms(self, slices, rollout)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.func import functional_call
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import WorldModel
@@ -120,8 +121,10 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
     def _metric_names(self) -> tuple[str, ...]:
         return ("value_error", "value_target")
 
-    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        return value_terms(self, slices, rollout)
+    def _terms(
+        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        return value_terms(self, slices, rollout, target_values)
 
 
 def register_discount(loss: LatentRolloutLoss, discount: float) -> None:
@@ -132,20 +135,18 @@ def register_discount(loss: LatentRolloutLoss, discount: float) -> None:
 
 
 def value_terms(
-    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
+    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Term ``[T, B]`` and metrics of the value heads, for any loss that owns target value parameters."""
     world_model = loss.world_model
 
-    def target_values(latent: Tensor) -> Tensor:
-        # The default would leave the targets behind as parameters that require a gradient.
-        with loss.target_value_params.to_module(loss.value, preserve_module_state=False):
-            logits = loss.value(latent)
+    def values(latent: Tensor) -> Tensor:
+        logits = functional_call(loss.value, target_values, (latent,))
         return two_hot_decode(logits, world_model.bins).movedim(0, -1)
 
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
     target = imagined_value_target(
-        world_model, target_values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
+        world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
     )
     error = value_error(world_model, rollout, target, dropout=loss.training)
     return {"value": loss._discount_depth(error)}, {"value_error": error.mean(), "value_target": target.mean()}

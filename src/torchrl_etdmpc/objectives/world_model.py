@@ -122,7 +122,9 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
     def _metric_names(self) -> tuple[str, ...]:
         return tuple(f"{name}_error" for name in self._term_names)
 
-    def _terms(self, slices: Slices, rollout: LatentRollout) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _terms(
+        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         return model_terms(self, slices, rollout)
 
 

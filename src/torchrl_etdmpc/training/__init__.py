@@ -8,7 +8,6 @@ from torchrl_etdmpc.training.builders import (
     build_reanalyze,
     build_replay,
     build_world_model,
-    resolve_compile,
     resolve_device,
 )
 from torchrl_etdmpc.training.checkpoint import CheckpointError, load_agent, read_checkpoint, save_checkpoint
@@ -47,7 +46,6 @@ __all__ = [
     "preset",
     "progress_bar",
     "read_checkpoint",
-    "resolve_compile",
     "resolve_device",
     "save_checkpoint",
     "write_mp4",

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +15,7 @@ from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
+from torchrl_etdmpc.training.compilation import compile_call, resolve_compile
 from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig
 from torchrl_etdmpc.training.updater import Updater
 
@@ -31,6 +30,13 @@ class Agent:
     reanalyze_planner: EnsembleMPPIPlanner
     loss: EfficientTDMPCLoss
     updater: Updater
+    compile_mode: str | None = None
+
+    def make_eager(self) -> None:
+        """Gives up compilation."""
+        for planner in (self.planner, self.eval_planner, self.reanalyze_planner):
+            planner.__dict__.pop("plan", None)
+        self.updater.make_eager()
 
 
 def resolve_device(name: str) -> torch.device:
@@ -47,21 +53,6 @@ def resolve_device(name: str) -> torch.device:
             f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
         )
     return device
-
-
-def resolve_compile(setting: str, device: torch.device) -> str | None:
-    """The ``torch.compile`` mode of ``auto``, ``off`` or ``default``; ``None`` is eager.
-
-    ``auto`` compiles where a compiler exists: always on CUDA, on a CPU if there is a C++ compiler; it warns if not.
-    """
-    if setting == "off":
-        return None
-    if setting == "auto" and device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
-        warnings.warn(
-            "no C++ compiler found, so nothing is compiled and training is slower; install g++.", stacklevel=2
-        )
-        return None
-    return "default"
 
 
 def build_world_model(config: ModelConfig, observation_dim: int, action_dim: int) -> WorldModel:
@@ -116,7 +107,7 @@ def build_planner(
         proposal_log_std_bounds=proposal_log_std_bounds,
     )
     if compile_mode is not None:
-        planner.plan = torch.compile(planner.plan, mode=compile_mode, dynamic=False, fullgraph=True)
+        planner.plan = compile_call(planner.plan, compile_mode)
     return planner
 
 
@@ -133,9 +124,8 @@ def build_agent(
     """
     device = torch.device(device)
     compile_mode = resolve_compile(config.compile, device)
-    # On a CPU compilation pays where operator overhead dominates, which is planning for one state; the large batches of
-    # the loss and of evaluations gain nothing from it and would add minutes of compilation.
-    batched_mode = compile_mode if device.type == "cuda" else None
+    # The few evaluations of a run on a CPU do not earn back their compilation.
+    eval_mode = compile_mode if device.type == "cuda" else None
     discount = config.loss.discount
     if discount is None:
         discount = discount_from_episode_length(config.task_spec.decision_steps_per_episode)
@@ -158,11 +148,11 @@ def build_agent(
         encoder_lr_scale=config.optim.encoder_lr_scale,
         grad_clip_norm=config.optim.grad_clip_norm,
         tau=config.loss.tau,
-        compile_mode=batched_mode,
+        compile_mode=compile_mode,
     )
     planner = build_planner(world_model, config.planner, discount=discount, warm_start=True, compile_mode=compile_mode)
     eval_planner = build_planner(
-        world_model, config.planner, discount=discount, warm_start=True, compile_mode=batched_mode
+        world_model, config.planner, discount=discount, warm_start=True, compile_mode=eval_mode
     )
     reanalyze_planner = build_planner(
         world_model,
@@ -172,7 +162,7 @@ def build_agent(
         proposal_log_std_bounds=(config.reanalyze.proposal_log_std_min, config.reanalyze.proposal_log_std_max),
         compile_mode=compile_mode,
     )
-    return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater)
+    return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater, compile_mode)
 
 
 def build_replay(config: TrainConfig, device: torch.device | str = "cpu") -> TensorDictReplayBuffer:

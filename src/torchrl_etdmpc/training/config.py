@@ -240,7 +240,7 @@ class TrainConfig:
             "resume is not implemented yet; start a new run_dir (evaluate.py can load its checkpoints).",
         )
         _require_choice("device", self.device.split(":")[0], ("auto", "cpu", "cuda"))
-        _require_choice("compile", self.compile, ("auto", "off", "default"))
+        _require_choice("compile", self.compile, ("auto", "off", "default", "max"))
         _require_choice("logger", self.logger, ("none", "tensorboard", "wandb"))
         _require_positive("", self, "num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every")
         _require(self.threads is None or self.threads >= 1, f"threads must be at least 1, got {self.threads}.")

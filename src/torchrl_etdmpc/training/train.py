@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase
+from tensordict import TensorDict
+from torchrl import torchrl_logger
+from torchrl.envs import EnvBase, ExplorationType
+from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.collectors import NonFiniteError
 from torchrl_etdmpc.training.builders import (
@@ -50,6 +54,7 @@ class TrainingRun:
         self._metrics: dict[str, torch.Tensor] = {}
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
         self._start = time.perf_counter()
+        self._compile_s = 0.0
         self._learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
 
     @property
@@ -74,6 +79,7 @@ class TrainingRun:
         """
         config = self.config
         try:
+            self.warm_up()
             with progress_bar(config.total_env_steps) as progress:
                 self.evaluate()
                 for _ in range(math.ceil(config.seed_decisions / config.num_envs)):
@@ -108,6 +114,65 @@ class TrainingRun:
         summary = self.summary()
         self.log.finish(summary)
         return summary
+
+    def warm_up(self) -> None:
+        """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
+
+        With ``compile=auto`` a failure to compile is a warning, and the run goes on without.
+        """
+        if self.agent.compile_mode is None:
+            return
+        tick = time.perf_counter()
+        calls = 1 if self.agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
+        try:
+            with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+                for _ in range(calls):
+                    self._call_everything()
+        except Exception as error:
+            if self.config.compile != "auto":
+                raise
+            self.agent.make_eager()
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            warnings.warn(f"cannot compile here, so training is slower: {reason}", stacklevel=2)
+        self._compile_s = time.perf_counter() - tick
+        torchrl_logger.info(f"compiled in {self._compile_s:.0f} s")
+
+    def _call_everything(self) -> None:
+        """One call of every compiled part, in the shapes of the run."""
+        config, sizes = self.config, self.agent.world_model
+        observation, action = (
+            torch.zeros(sizes.observation_dim, device=self.device),
+            torch.zeros(sizes.action_dim, device=self.device),
+        )
+
+        def states(*batch: int) -> TensorDict:
+            plan = self.agent.planner.horizon, sizes.action_dim
+            values = {"observation": observation.expand(*batch, -1).clone()}
+            values["plan_mean"] = torch.zeros(*batch, *plan, device=self.device)
+            values["is_init"] = torch.ones(*batch, 1, dtype=torch.bool, device=self.device)
+            return TensorDict(values, batch)
+
+        with set_exploration_type(ExplorationType.RANDOM):
+            self.agent.planner(states(*self.collector.env.batch_size))
+            if self.reanalyze is not None:
+                rows = config.reanalyze.num_slices * config.loss.slice_len
+                self.agent.reanalyze_planner(states(rows).select("observation"))
+        if self.device.type == "cuda":
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                self.agent.eval_planner(states(*self.eval_env.batch_size))
+        slices = [config.optim.batch_size, config.loss.slice_len]
+        flag = torch.zeros(*slices, 1, device=self.device)
+        row = {
+            "observation": observation.expand(*slices, -1).clone(),
+            "action": action.expand(*slices, -1).clone(),
+            "next": {
+                "observation": observation.expand(*slices, -1).clone(),
+                "reward": flag,
+                "terminated": flag.bool(),
+            },
+            "plan": {"loc": action.expand(*slices, -1).clone(), "scale": action.expand(*slices, -1) + 1},
+        }
+        self.agent.updater.warm_up(TensorDict(row, slices))
 
     def step(self) -> None:
         """One decision of every environment."""
@@ -172,6 +237,7 @@ class TrainingRun:
             "final_return": self.eval_returns[-1],
             "best_return": max(self.eval_returns),
             "wall_time_s": self.counters()["wall_time_s"],
+            "compile_s": round(self._compile_s, 2),
             "decisions_per_second": learned / self._learning_s if self._learning_s else math.nan,
             "parameters": sum(parameter.numel() for parameter in self.agent.world_model.parameters()),
             "device": torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",

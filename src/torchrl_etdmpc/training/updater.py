@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Slices
+from torchrl_etdmpc.training.compilation import compile_call
 
 
 class Updater:
@@ -26,7 +28,8 @@ class Updater:
         encoder_lr_scale (float): factor of the encoder's learning rate. Default: 0.3.
         grad_clip_norm (float): largest gradient norm of the model and of the policy. Default: 20.
         tau (float): rate of the target values. Default: 0.01.
-        compile_mode (str, optional): ``torch.compile`` mode of the loss (``"default"``). Default: ``None``, eager.
+        compile_mode (str, optional): ``torch.compile`` mode of loss and gradient, one graph. Default: ``None``, eager.
+            An update without distillation is always eager: pretraining is short.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.testing import random_slices
@@ -61,7 +64,7 @@ class Updater:
         )
         self.policy_optimizer = torch.optim.Adam(self.policy_parameters, eps=1e-5, **options)
         self.target_update = SoftUpdate(loss, tau=tau)
-        self._forward = loss if compile_mode is None else torch.compile(loss, mode=compile_mode, dynamic=False)
+        self._compiled = None if compile_mode is None else compile_call(self._gradients, compile_mode, keep=False)
 
     @property
     def updates(self) -> int:
@@ -72,7 +75,7 @@ class Updater:
         """One update.
 
         Args:
-            batch (TensorDictBase): slices, batch size [B, T].
+            batch (TensorDictBase): slices, batch size [B, T]; priorities and masks are not read.
             distill (bool): whether to train the policy (pretraining does not).
 
         Returns:
@@ -80,10 +83,15 @@ class Updater:
         """
         if self.loss.distill != distill:
             self.loss.distill = distill
-        out = self._forward(batch)
-        total = sum(value for key, value in out.items() if key.startswith("loss_"))
-        total.backward()
-        out = out.detach()
+        inputs = self.loss.slices(batch), self.loss.target_values()
+        if self._compiled is None or not distill:
+            metrics, gradients = self._gradients(*inputs)
+        else:
+            with torch._dynamo.config.patch(trace_autograd_ops=True):
+                metrics, gradients = self._compiled(*inputs)
+        out = TensorDict(metrics, batch_size=[]).clone()
+        for parameter, gradient in zip(self._trained(), gradients, strict=True):
+            parameter.grad = gradient
         out["grad_norm_model"] = torch.nn.utils.clip_grad_norm_(self.model_parameters, self.grad_clip_norm)
         self.model_optimizer.step()
         self.model_optimizer.zero_grad()
@@ -94,6 +102,39 @@ class Updater:
         self.target_update.step()
         self.loss.world_model.version += 1
         return out
+
+    def warm_up(self, batch: TensorDictBase) -> None:
+        """Compiles on a batch of the shapes to come; weights, running scale and optimisers stay as they are.
+
+        Args:
+            batch (TensorDictBase): slices, batch size [B, T]; the values do not matter.
+        """
+        if self._compiled is None:
+            return
+        distill, scale = self.loss.distill, self.loss.kl_scale.clone()
+        self.loss.distill = True
+        try:
+            with torch._dynamo.config.patch(trace_autograd_ops=True):
+                self._compiled(self.loss.slices(batch), self.loss.target_values())
+        finally:
+            self.loss.kl_scale.copy_(scale)
+            self.loss.distill = distill
+
+    def make_eager(self) -> None:
+        """Gives up compilation."""
+        self._compiled = None
+
+    def _trained(self) -> list[torch.nn.Parameter]:
+        return self.model_parameters + (self.policy_parameters if self.loss.distill else [])
+
+    def _gradients(
+        self, slices: Slices, target_values: dict[str, Tensor]
+    ) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
+        """Losses and metrics, and the gradient of the summed losses for every trained parameter."""
+        out = self.loss.evaluate(slices, target_values)
+        total = sum(value for key, value in out.items() if key.startswith("loss_"))
+        gradients = torch.autograd.grad(total, self._trained())
+        return {key: value.detach() for key, value in out.items()}, gradients
 
     def state_dict(self) -> dict[str, Any]:
         """State of both optimisers (the weights belong to the loss)."""

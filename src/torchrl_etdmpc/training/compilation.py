@@ -1,0 +1,52 @@
+"""Whole-call compilation: one graph per planning call and one per gradient."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch.utils._pytree import tree_map_only
+
+
+def resolve_compile(setting: str, device: torch.device) -> str | None:
+    """The ``torch.compile`` mode of ``auto``, ``off``, ``default`` or ``max``; ``None`` is eager.
+
+    ``auto`` compiles where a compiler exists, on CUDA with CUDA graphs; it warns if there is none. ``default`` compiles
+    without CUDA graphs, ``max`` tunes the matrix products as well.
+    """
+    if setting == "off":
+        return None
+    if setting == "auto" and device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
+        warnings.warn(
+            "no C++ compiler found, so nothing is compiled and training is slower; install g++.", stacklevel=2
+        )
+        return None
+    if setting == "auto":
+        return "reduce-overhead" if device.type == "cuda" else "default"
+    return {"default": "default", "max": "max-autotune"}[setting]
+
+
+def compile_call(function: Callable[..., Any], mode: str, *, keep: bool = True) -> Callable[..., Any]:
+    """Compiles a function of tensors as one graph of fixed shapes.
+
+    Args:
+        function (callable): traced without a graph break, or compilation fails.
+        mode (str): of ``torch.compile``.
+        keep (bool): whether results must outlive the next call. CUDA graphs write them to the same memory every time,
+            so they are copied. Default: ``True``.
+    """
+    compiled = torch.compile(function, mode=mode, dynamic=False, fullgraph=True)
+    if mode == "default":
+        return compiled
+
+    @functools.wraps(function)
+    def replay(*args: Any, **kwargs: Any) -> Any:
+        torch.compiler.cudagraph_mark_step_begin()
+        result = compiled(*args, **kwargs)
+        return tree_map_only(torch.Tensor, torch.clone, result) if keep else result
+
+    return replay

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import copy
+import shutil
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+
+from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.testing import random_slices  # noqa: E402
+from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, build_agent, preset  # noqa: E402
+from torchrl_etdmpc.training.compilation import compile_call, resolve_compile  # noqa: E402
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler"
+)
+
+
+def tiny_config(**changes) -> TrainConfig:
+    values = preset("cpu").to_dict() | {"task": "cartpole-balance", "total_env_steps": 120, "eval_episodes": 1}
+    values["model"] |= {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16}
+    values["planner"] |= {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 2}
+    values["reanalyze"] |= {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "num_slices": 2}
+    values["optim"] |= {"batch_size": 4}
+    values["replay"] |= {"seed_decisions": 50, "pretrain_updates": 3}
+    return TrainConfig.from_dict(values | changes)
+
+
+def make_run(config: TrainConfig, run_dir: Path) -> TrainingRun:
+    torch.manual_seed(0)
+    env, eval_env = (make_dmc_env(config.task, seed=seed) for seed in (0, 1))
+    log = RunLog.create(run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps)
+    return TrainingRun(config, env=env, eval_env=eval_env, log=log)
+
+
+@pytest.mark.parametrize(
+    ("setting", "device", "compiler", "mode"),
+    [
+        ("off", "cpu", "g++", None),
+        ("off", "cuda", "g++", None),
+        ("auto", "cpu", "g++", "default"),
+        ("auto", "cpu", "clang++", "default"),
+        ("auto", "cuda", None, "reduce-overhead"),
+        ("default", "cpu", None, "default"),
+        ("default", "cuda", None, "default"),
+        ("max", "cuda", None, "max-autotune"),
+    ],
+)
+def test_auto_compiles_where_a_compiler_exists(monkeypatch, setting, device, compiler, mode):
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}" if name == compiler else None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert resolve_compile(setting, torch.device(device)) == mode
+
+
+def test_the_results_of_a_graph_that_is_replayed_outlive_the_next_call(monkeypatch):
+    memory = torch.zeros(2)  # CUDA graphs write every result to the same place
+
+    def replayed(value: float) -> tuple[torch.Tensor, int]:
+        return memory.fill_(value), 7
+
+    monkeypatch.setattr(torch, "compile", lambda function, **options: function)
+    call = compile_call(replayed, "reduce-overhead")
+    first, number = call(1.0)
+    call(2.0)
+    assert (first.tolist(), number) == ([1, 1], 7)
+    borrowed, _ = compile_call(replayed, "reduce-overhead", keep=False)(3.0)
+    assert borrowed is memory
+
+
+def test_a_run_that_cannot_compile_goes_on_without_and_says_so_once(tmp_path, monkeypatch):
+    def broken(function, **options):
+        def call(*args, **kwargs):
+            raise RuntimeError("no such file: omp.h\nand a long log")
+
+        return call
+
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/g++")
+    monkeypatch.setattr(torch, "compile", broken)
+    run = make_run(tiny_config(), tmp_path)
+    with pytest.warns(
+        UserWarning, match=r"^cannot compile here, so training is slower: no such file: omp.h$"
+    ) as caught:
+        run.run()
+    assert len(caught) == 1
+    assert run.agent.updater.updates == 3 + 10
+
+
+def test_a_run_that_must_compile_and_cannot_stops(tmp_path, monkeypatch):
+    def broken(function, **options):
+        raise RuntimeError("no compiler")
+
+    monkeypatch.setattr(torch, "compile", broken)
+    with pytest.raises(RuntimeError, match="no compiler"):
+        make_run(tiny_config(compile="default"), tmp_path).run()
+
+
+@pytest.fixture(scope="module")
+def warmed(tmp_path_factory):
+    """A run of small networks that was warmed up, and what it was before."""
+    run = make_run(tiny_config(compile="default"), tmp_path_factory.mktemp("runs") / "run")
+    before = copy.deepcopy(run.agent.loss.state_dict()), torch.get_rng_state()
+    torch._dynamo.utils.counters.clear()
+    run.warm_up()
+    yield run, before, (copy.deepcopy(run.agent.loss.state_dict()), torch.get_rng_state())
+    run.collector.shutdown()
+    run.eval_env.close()
+
+
+@needs_compiler
+def test_warming_up_moves_neither_weights_nor_the_running_scale_nor_random_numbers(warmed):
+    run, (weights, state), (weights_after, state_after) = warmed
+    assert torch.equal(state, state_after)
+    assert all(torch.equal(value, weights_after[name]) for name, value in weights.items())
+    assert run.agent.updater.updates == 0
+    assert run.agent.loss.distill
+    assert len(run.replay) == 0
+
+
+@needs_compiler
+def test_a_run_that_was_warmed_up_compiles_nothing_more(warmed):
+    run, _, _ = warmed
+    graphs = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    assert graphs == 3  # acting, reanalyze and the gradients: one graph each
+    assert not torch._dynamo.utils.counters["graph_break"]
+    for _ in range(50):
+        run.step()
+    run.pretrain()
+    for _ in range(2 * run.reanalyze.interval):
+        run.step()
+        run.update()
+    assert run.reanalyze.refreshed > 0
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == graphs
+
+
+@needs_compiler
+def test_a_compiled_update_equals_an_eager_one(warmed):
+    agent = warmed[0].agent
+    eager = build_agent(tiny_config(compile="off"), 5, 1)
+    eager.loss.load_state_dict(agent.loss.state_dict())
+    batch = random_slices(5, 1, num_slices=4)
+    inputs = [(loss.slices(batch), loss.target_values()) for loss in (agent.loss, eager.loss)]
+    torch.manual_seed(1)
+    metrics, gradients = eager.updater._gradients(*inputs[1])
+    torch.manual_seed(1)
+    compiled = compile_call(agent.updater._gradients, "default")
+    with torch._dynamo.config.patch(trace_autograd_ops=True), torch._inductor.config.patch(fallback_random=True):
+        fast_metrics, fast_gradients = compiled(*inputs[0])
+    torch.testing.assert_close(fast_metrics, metrics, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(fast_gradients, gradients, rtol=1e-3, atol=1e-5)
