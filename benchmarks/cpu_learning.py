@@ -1,11 +1,11 @@
-"""Learning runs of the cpu preset: every task and seed, two at a time with one thread each, and one figure.
+"""Learning runs of the cpu preset: every task and seed, two at a time with one thread each, and a report.
 
     python benchmarks/cpu_learning.py                        # the committed runs (about two hours on two cores)
     python benchmarks/cpu_learning.py --tasks walker-stand --seeds 1
-    python benchmarks/cpu_learning.py --figure-only          # redraw from the committed files
+    python benchmarks/cpu_learning.py --report-only          # from the committed files
 
-Writes `benchmarks/results/cpu/<task>/seed<k>/{eval.csv,summary.json}`, `curves.png` and `README.md`. A run that is
-there already is kept; remove its folder to repeat it.
+Writes `benchmarks/results/cpu/<task>/seed<k>/{eval.csv,summary.json}`, `README.md` with budgets and wall times, and
+`report/` with the comparison to published curves. A run that is there already is kept; remove its folder to repeat it.
 """
 
 from __future__ import annotations
@@ -20,18 +20,13 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import pandas as pd  # noqa: E402
+import pandas as pd
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
 TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch")
 SEEDS = (1, 2, 3)
 ENV_STEPS = 50_000
-BLUE = "#0072B2"
 
 
 def run(task: str, seed: int, env_steps: int) -> str:
@@ -60,30 +55,15 @@ def collect() -> pd.DataFrame:
         table["task"], table["seed"] = file.parent.parent.name, int(file.parent.name.removeprefix("seed"))
         tables.append(table)
     if not tables:
-        sys.exit(f"error: no runs under {RESULTS}; run this script without --figure-only first.")
+        sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
     return pd.concat(tables)
 
 
-def draw(table: pd.DataFrame) -> None:
-    """One panel per task: every seed as a thin line, their mean as a thick one."""
-    tasks = [task for task in TASKS if task in set(table.task)] + sorted(set(table.task) - set(TASKS))
-    columns = min(len(tasks), 2)
-    rows = -(-len(tasks) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4.5 * columns, 3 * rows), squeeze=False, sharey=True)
-    for axis in axes.flat[len(tasks) :]:
-        axis.remove()
-    for axis, task in zip(axes.flat, tasks, strict=False):
-        curves = table[table.task == task].pivot(index="env_steps", columns="seed", values="return_mean")
-        axis.plot(curves.index / 1000, curves, color=BLUE, alpha=0.35, linewidth=1)
-        axis.plot(curves.index / 1000, curves.mean(axis=1), color=BLUE, linewidth=2)
-        axis.set_title(f"{task} ({curves.shape[1]} seeds)")
-        axis.set_xlim(left=0)
-        axis.set_ylim(0, 1000)
-        axis.grid(alpha=0.3)
-        axis.set_xlabel("environment steps (thousands)")
-        axis.set_ylabel("episode return")
-    figure.tight_layout()
-    figure.savefig(RESULTS / "curves.png", dpi=150)
+def write_report() -> None:
+    """Beside the published curves, up to the budget of these runs."""
+    runs = sorted({str(file.parent.parent) for file in RESULTS.glob("*/seed*/eval.csv")})
+    command = [sys.executable, str(ROOT / "examples" / "report.py"), *runs, "--budget", str(ENV_STEPS)]
+    subprocess.run([*command, "--grid-step", "10000", "--out", str(RESULTS / "report")], check=True)
 
 
 def write_readme(table: pd.DataFrame) -> None:
@@ -111,7 +91,14 @@ def write_readme(table: pd.DataFrame) -> None:
             f"({', '.join(f'{value:.0f}' for value in finals)}) | {curve.max():.0f} at {curve.idxmax()} "
             f"| {walls[0]:.1f} to {walls[-1]:.1f} | {speeds[0]:.0f} to {speeds[-1]:.0f} |"
         )
-    lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + ".", "", "![curves](curves.png)", ""]
+    lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
+    lines += [
+        "",
+        "Beside published curves: [report](report/index.md).",
+        "",
+        "![learning curves](report/curves.png)",
+        "",
+    ]
     (RESULTS / "README.md").write_text("\n".join(lines))
 
 
@@ -121,17 +108,16 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
-    parser.add_argument("--figure-only", action="store_true")
+    parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
-    if not arguments.figure_only:
+    if not arguments.report_only:
         with ThreadPoolExecutor(arguments.jobs) as pool:
             runs = [(task, seed) for seed in arguments.seeds for task in arguments.tasks]
             for line in pool.map(lambda pair: run(*pair, arguments.env_steps), runs):
                 print(line, flush=True)
     table = collect()
-    draw(table)
     write_readme(table)
-    print(f"figure and table are in {RESULTS.relative_to(ROOT)}")
+    write_report()
 
 
 if __name__ == "__main__":
