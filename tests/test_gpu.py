@@ -55,7 +55,7 @@ def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
     assert evaluate(eval_env, agent.eval_planner, episodes=1, policy_device="cuda").isfinite().all()
 
 
-@pytest.mark.parametrize("compile_mode", ["off", "default"])
+@pytest.mark.parametrize("compile_mode", ["off", "default", "auto"])
 def test_a_plan_and_an_update_agree_with_the_cpu(compile_mode):
     torch.manual_seed(0)
     config = dataclasses.replace(small(), compile=compile_mode)
@@ -74,8 +74,9 @@ def test_a_plan_and_an_update_agree_with_the_cpu(compile_mode):
         torch.testing.assert_close(metrics["cuda"][name].cpu(), metrics["cpu"][name], atol=1e-3, rtol=1e-2)
 
 
-def test_compiled_replays_draw_new_noise():
-    config = dataclasses.replace(small(), compile="default")
+@pytest.mark.parametrize("compile_mode", ["default", "auto"])
+def test_compiled_replays_draw_new_noise(compile_mode):
+    config = dataclasses.replace(small(), compile=compile_mode)
     planner = build_agent(config, 3, 1, "cuda").planner
     observation = torch.zeros(1, 3, device="cuda")
     actions = torch.cat([planner.plan(observation).action for _ in range(8)])

@@ -1,0 +1,121 @@
+"""Collects what the benchmarks measured in ``results/<device>/speed.{json,md}``."""
+
+from __future__ import annotations
+
+import json
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+CUDA = torch.cuda.is_available()
+RESULTS = Path(__file__).parent / "results" / ("gpu" if CUDA else "cpu")
+ROWS = pytest.StashKey[list]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    sys.path.insert(0, str(Path(__file__).parent))
+    config.stash[ROWS] = []
+    torch.set_num_threads(1)
+    torch.set_float32_matmul_precision("high")
+
+
+class Measure:
+    """Times a call with pytest-benchmark and keeps the row."""
+
+    def __init__(self, benchmark, rows: list[dict], limit: float) -> None:
+        self.benchmark, self.rows, self.limit = benchmark, rows, limit
+
+    @staticmethod
+    def flop(call: Callable[[], object]) -> int:
+        """Floating point operations of the matrix products of one call."""
+        with FlopCounterMode(display=False) as counter:
+            call()
+        return counter.get_total_flops()
+
+    def __call__(
+        self,
+        case: str,
+        variant: str,
+        call: Callable[[], object],
+        *,
+        rounds: int,
+        flop: int | None = None,
+        baseline: str = "eager",
+    ) -> None:
+        def timed() -> None:
+            call()
+            if CUDA:
+                torch.cuda.synchronize()
+
+        self.benchmark.pedantic(timed, rounds=rounds, warmup_rounds=2)
+        median = self.benchmark.stats.stats.median
+        row = {"case": case, "variant": variant, "threads": torch.get_num_threads(), "median_ms": 1000 * median}
+        row["gflop"] = None if flop is None else flop / 1e9
+        row["of_limit"] = None if flop is None else flop / 1e9 / median / self.limit
+        row["baseline"] = baseline
+        known = [other["median_ms"] for other in self.rows if other["case"] == case and other["variant"] == baseline]
+        row["ratio"] = 1.0 if variant == baseline else known[0] / row["median_ms"] if known else None
+        self.rows.append(row)
+
+
+@pytest.fixture(scope="session")
+def matmul_limit() -> float:
+    """GFLOP/s of a large product in this process, on this many threads."""
+    size = 8192 if CUDA else 2048
+    left, right = (torch.randn(size, size, device="cuda" if CUDA else "cpu") for _ in range(2))
+    times = []
+    for _ in range(8):
+        tick = time.perf_counter()
+        left @ right
+        if CUDA:
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - tick)
+    return 2 * size**3 / 1e9 / statistics.median(times[2:])
+
+
+@pytest.fixture
+def measure(benchmark, matmul_limit: float, request: pytest.FixtureRequest) -> Measure:
+    return Measure(benchmark, request.config.stash[ROWS], matmul_limit)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    rows = session.config.stash[ROWS]
+    if not rows:
+        return
+    file = RESULTS / "speed.json"
+    about = {
+        "device": torch.cuda.get_device_name() if CUDA else platform.machine(),
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in ("torch", "torchrl", "tensordict")},
+    }
+    done = {(row["case"], row["variant"]) for row in rows}
+    old = json.loads(file.read_text()) if file.exists() else []
+    rows = [row for row in old if (row["case"], row["variant"]) not in done] + [row | about for row in rows]
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(rows, indent=1) + "\n")
+    versions = ", ".join(f"{name} {number}" for name, number in about["versions"].items())
+    lines = [
+        "# Speed",
+        "",
+        f"Made by `make bench` on {about['device']}; {versions}.",
+        "Medians; `of limit` is the share of the speed of a large matrix product in the same process. The ratio is the",
+        "baseline's time over this one, both of one process.",
+        "",
+        "| case | variant | threads | ms | GFLOP | of limit | baseline | ratio |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in sorted(rows, key=lambda row: row["case"]):
+        cells = [row["case"], row["variant"], row["threads"], f"{row['median_ms']:.3g}"]
+        cells += ["" if row["gflop"] is None else f"{row['gflop']:.3g}"]
+        cells += ["" if row["of_limit"] is None else f"{row['of_limit']:.2f}", row["baseline"]]
+        cells += ["" if row["ratio"] is None else f"{row['ratio']:.2f}"]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    (RESULTS / "speed.md").write_text("\n".join(lines) + "\n")
