@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from torchrl_etdmpc import functional
 from torchrl_etdmpc.functional import bounded_log_std, clipped_sample, simnorm, two_hot_decode, two_hot_encode
 from torchrl_etdmpc.modules import MLP, DynamicsEnsemble, Encoder, GaussianPolicy, ValueEnsemble, WorldModel
 
@@ -415,7 +416,7 @@ def test_the_activation_reaches_every_network():
     assert networks == ["encoder", "dynamics", "reward_head", "value_head", "policy", "termination_head"]
     for name in networks:
         activations = [{layer.activation for layer in getattr(m, name).hidden} for m in (mish, relu)]
-        assert activations == [{nn.functional.mish}, {nn.functional.relu}], name
+        assert activations == [{functional.mish}, {nn.functional.relu}], name
 
 
 # State
@@ -517,7 +518,7 @@ def test_compiled_predictions_equal_eager_ones_without_a_graph_break():
     torch._dynamo.reset()
     compiled = torch.compile(predict, fullgraph=True, backend="eager")(latent, action)
     for a, b in zip(compiled, predict(latent, action), strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)  # mish is written otherwise there
     torch._dynamo.reset()
 
 

@@ -1,5 +1,6 @@
 """Pure maths on tensors: no state, no modules, any leading batch."""
 
+from torchrl_etdmpc.functional.activation import mish
 from torchrl_etdmpc.functional.gaussian import bounded_log_std, clipped_sample, gaussian_entropy, gaussian_kl
 from torchrl_etdmpc.functional.horizon import adaptive_mixture, ensemble_mean, ensemble_variance
 from torchrl_etdmpc.functional.mppi import (
@@ -18,6 +19,7 @@ from torchrl_etdmpc.functional.simnorm import simnorm
 from torchrl_etdmpc.functional.two_hot import symexp, symlog, two_hot_cross_entropy, two_hot_decode, two_hot_encode
 
 __all__ = [
+    "mish",
     "Elites",
     "Gaussian",
     "adaptive_mixture",

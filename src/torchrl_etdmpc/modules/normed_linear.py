@@ -9,10 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from torchrl_etdmpc.functional import mish
+
 INIT_STD = 0.02
 
 Activation = Literal["mish", "silu", "relu"]
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"mish": F.mish, "silu": F.silu, "relu": F.relu}
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"mish": mish, "silu": F.silu, "relu": F.relu}
 
 
 class EnsembleLinear(nn.Module):

@@ -206,9 +206,10 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         observation = tensordict.get(self.observation_key, None)
         latent = None if self.latent_key is None else tensordict.get(self.latent_key, None)
         if observation is None and latent is None:
+            either = "" if self.latent_key is None else f" (or {self.latent_key!r})"
             raise KeyError(
-                f"the planner needs {self.observation_key!r} (or 'latent') in its input; pass observation_key=... if "
-                "your environment names it otherwise."
+                f"the planner needs {self.observation_key!r}{either} in its input; pass observation_key=... if your "
+                "environment names it otherwise."
             )
         if observation is not None and latent is not None:
             raise ValueError(
