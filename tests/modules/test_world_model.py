@@ -518,7 +518,7 @@ def test_compiled_predictions_equal_eager_ones_without_a_graph_break():
     torch._dynamo.reset()
     compiled = torch.compile(predict, fullgraph=True, backend="eager")(latent, action)
     for a, b in zip(compiled, predict(latent, action), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)  # mish is written otherwise there
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)  # mish is written otherwise there
     torch._dynamo.reset()
 
 
