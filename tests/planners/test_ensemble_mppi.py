@@ -981,7 +981,7 @@ def test_precision_makes_no_difference_to_the_first_returns():
 
 
 def test_one_compiled_graph_plans_as_eager_code_does():
-    # The backend runs the traced graph as it is, so that the numbers must agree to the last bit.
+    # The backend runs the traced graph as it is, in double precision; only mish is written otherwise there.
     counter = CompileCounter()
     planner, observation = make_planner(score="adaptive", beta=1.0, iterations=2), states(3)
     carried, noise = torch.rand(3, 3, 2, dtype=torch.float64), planner.draw_noise(3)
@@ -990,7 +990,7 @@ def test_one_compiled_graph_plans_as_eager_code_does():
         plan = compiled(observation, carried, noise=noise)
         expected = planner.plan(observation, carried, noise=noise)
         for name in Plan._fields[:-1]:
-            assert torch.equal(getattr(plan, name), getattr(expected, name)), name
+            torch.testing.assert_close(getattr(plan, name), getattr(expected, name), rtol=1e-10, atol=1e-12, msg=name)
     assert counter.frame_count == 1
 
 
