@@ -139,17 +139,15 @@ class TrainingRun:
 
     def _call_everything(self) -> None:
         """One call of every compiled part, in the shapes of the run."""
-        config, sizes = self.config, self.agent.world_model
-        observation, action = (
-            torch.zeros(sizes.observation_dim, device=self.device),
-            torch.zeros(sizes.action_dim, device=self.device),
-        )
+        config, model = self.config, self.agent.world_model
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(shape, dtype=dtype, device=self.device)
 
         def states(*batch: int) -> TensorDict:
-            plan = self.agent.planner.horizon, sizes.action_dim
-            values = {"observation": observation.expand(*batch, -1).clone()}
-            values["plan_mean"] = torch.zeros(*batch, *plan, device=self.device)
-            values["is_init"] = torch.ones(*batch, 1, dtype=torch.bool, device=self.device)
+            carried = zeros(*batch, self.agent.planner.horizon, model.action_dim)
+            is_init = zeros(*batch, 1, dtype=torch.bool)
+            values = {"observation": zeros(*batch, model.observation_dim), "plan_mean": carried, "is_init": is_init}
             return TensorDict(values, batch)
 
         with set_exploration_type(ExplorationType.RANDOM):
@@ -160,19 +158,13 @@ class TrainingRun:
         if self.device.type == "cuda":
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 self.agent.eval_planner(states(*self.eval_env.batch_size))
-        slices = [config.optim.batch_size, config.loss.slice_len]
-        flag = torch.zeros(*slices, 1, device=self.device)
-        row = {
-            "observation": observation.expand(*slices, -1).clone(),
-            "action": action.expand(*slices, -1).clone(),
-            "next": {
-                "observation": observation.expand(*slices, -1).clone(),
-                "reward": flag,
-                "terminated": flag.bool(),
-            },
-            "plan": {"loc": action.expand(*slices, -1).clone(), "scale": action.expand(*slices, -1) + 1},
-        }
-        self.agent.updater.warm_up(TensorDict(row, slices))
+        slices = config.optim.batch_size, config.loss.slice_len
+        action = zeros(*slices, model.action_dim)
+        following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
+        following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
+        rows = {"observation": following["observation"], "action": action, "next": following}
+        rows["plan"] = {"loc": action, "scale": action + 1}
+        self.agent.updater.warm_up(TensorDict(rows, slices))
 
     def step(self) -> None:
         """One decision of every environment."""
