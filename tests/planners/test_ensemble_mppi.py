@@ -980,6 +980,39 @@ def test_precision_makes_no_difference_to_the_first_returns():
     torch.testing.assert_close(rough.returns[:, 0].double(), exact.returns[:, 0], atol=1e-3, rtol=1e-3)
 
 
+def test_candidates_scored_in_half_precision_are_ranked_nearly_alike():
+    model, observation = make_model(), states(3).float()
+    model.float()
+    plain, half = make_planner(model), make_planner(model, scoring_dtype=torch.bfloat16)
+    noise = PlanNoise(*(draw.float() for draw in plain.draw_noise(3)))
+    exact, rough = (planner.plan(observation, noise=noise, trace=True).trace for planner in (plain, half))
+    assert rough.returns.dtype == rough.scores.dtype == rough.actions.dtype == torch.float32
+    assert not torch.equal(rough.returns[:, 0], exact.returns[:, 0])
+    spread = exact.returns[:, 0].std()
+    assert (rough.returns[:, 0] - exact.returns[:, 0]).square().mean().sqrt() < 0.05 * spread
+    for one, other in zip(rough.scores[:, 0], exact.scores[:, 0], strict=True):
+        assert torch.corrcoef(torch.stack([one, other]))[0, 1] > 0.99
+
+
+def test_half_precision_leaves_the_weights_as_they_are_and_follows_them():
+    model, observation = make_model(), states(2).float()
+    model.float()
+    planner = make_planner(model, scoring_dtype=torch.bfloat16)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    noise = PlanNoise(*(draw.float() for draw in planner.draw_noise(2)))
+    first = planner.plan(observation, noise=noise)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert first.action.dtype == torch.float32
+    with torch.no_grad():
+        model.reward_head.output.bias[-1] += 5
+    assert (planner.plan(observation, noise=noise).value > first.value).all()
+
+
+def test_a_scoring_dtype_that_is_not_floating_point_is_refused():
+    with pytest.raises(ValueError, match=r"^scoring_dtype must be a floating point dtype, got torch.int8\.$"):
+        make_planner(scoring_dtype=torch.int8)
+
+
 def test_one_compiled_graph_plans_as_eager_code_does():
     # The backend runs the traced graph as it is, in double precision; only mish is written otherwise there.
     counter = CompileCounter()

@@ -56,6 +56,7 @@ UTD4 = {
     "planner.std_max": 2.0,
     "planner.first_action": "elite",
     "planner.eval_first_action": "best",
+    "planner.scoring_dtype": "float32",
     "reanalyze.horizon": 3,
     "reanalyze.score": "final",
     "reanalyze.beta": 0.0,  # on DMC
@@ -70,6 +71,7 @@ UTD4 = {
     "reanalyze.std_max": 2.0,
     "reanalyze.first_action": "elite",
     "reanalyze.eval_first_action": "best",
+    "reanalyze.scoring_dtype": "float32",
     "reanalyze.every": 2,
     "reanalyze.num_slices": 20,
     "reanalyze.proposal_log_std_min": -2.0,
@@ -314,6 +316,10 @@ REFUSED = [
         "planner.beta must not be negative with planner.score=adaptive, got -1.0.",
     ),
     ({"planner__first_action": "worst"}, "planner.first_action must be one of elite, mean, best, got 'worst'."),
+    (
+        {"planner__scoring_dtype": "float16"},
+        "planner.scoring_dtype must be one of float32, bfloat16, got 'float16'.",
+    ),
     (
         {"reanalyze__eval_first_action": "any"},
         "reanalyze.eval_first_action must be one of elite, mean, best, got 'any'.",

@@ -156,11 +156,11 @@ class WorldModel(nn.Module):
 
     def reward(self, latent: Tensor, action: Tensor) -> Tensor:
         """Expected reward of ``action [..., A]`` in ``latent [..., L]``, shape ``[...]``."""
-        return two_hot_decode(self.reward_head(latent, action), self.bins)
+        return two_hot_decode(self.reward_head(latent, action).to(self.bins.dtype), self.bins)
 
     def values(self, latent: Tensor) -> Tensor:
         """Expected value of ``latent [..., L]`` by each value head, shape ``[..., V]``; never with dropout."""
-        return two_hot_decode(self.value_head(latent), self.bins).movedim(0, -1)
+        return two_hot_decode(self.value_head(latent).to(self.bins.dtype), self.bins).movedim(0, -1)
 
     def termination(self, latent: Tensor) -> Tensor | None:
         """Probability that the episode terminated on reaching ``latent [..., L]``, shape ``[...]``.

@@ -7,7 +7,8 @@ from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 from torchrl.data import Unbounded
 from torchrl.envs import ExplorationType, TensorDictPrimer
 from torchrl.envs.utils import exploration_type
@@ -69,6 +70,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             formula) or ``"best"`` (highest-scoring candidate of the last iteration). Default: ``"elite"``.
         eval_first_action (str): the same, when not exploring. Default: ``"best"``.
         warm_start (bool): whether to carry the plan from step to step. Default: ``True``.
+        scoring_dtype (torch.dtype, optional): in which candidates are rolled and scored, e.g. ``torch.bfloat16``; the
+            weights are cast once per call, and returns are summed in the weights' own dtype. Default: ``None``, that of
+            the weights.
         proposal_log_std_bounds (tuple of float, optional): bounds of the policy's log std while it proposes; BMPC
             widens them to (-2, 1) for reanalyze. Default: the policy's own.
         observation_key, action_key, is_init_key, plan_mean_key (NestedKey): tensordict keys.
@@ -107,6 +111,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         first_action: FirstAction = "elite",
         eval_first_action: FirstAction = "best",
         warm_start: bool = True,
+        scoring_dtype: torch.dtype | None = None,
         proposal_log_std_bounds: tuple[float, float] | None = None,
         observation_key: NestedKey = "observation",
         latent_key: NestedKey | None = "latent",
@@ -136,6 +141,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             raise ValueError(f"std_min and std_max must satisfy 0 < std_min <= std_max, got {std_min} and {std_max}.")
         if not 0 < discount <= 1:
             raise ValueError(f"discount must be in (0, 1], got {discount}.")
+        if scoring_dtype is not None and not scoring_dtype.is_floating_point:
+            raise ValueError(f"scoring_dtype must be a floating point dtype, got {scoring_dtype}.")
         for name, choice in {"first_action": first_action, "eval_first_action": eval_first_action}.items():
             if choice not in ("elite", "mean", "best"):
                 raise ValueError(f"{name} must be 'elite', 'mean' or 'best', got {choice!r}.")
@@ -155,6 +162,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.first_action = first_action
         self.eval_first_action = eval_first_action
         self.warm_start = warm_start
+        self.scoring_dtype = scoring_dtype
+        self.__dict__["_imagination"] = _Imagination(env.world_model)
         self.proposal_log_std_bounds = proposal_log_std_bounds
         self.observation_key = unravel_key(observation_key)
         self.latent_key = None if latent_key is None else unravel_key(latent_key)
@@ -303,6 +312,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         start = latent.new_zeros(shape) if plan_mean is None else shift_plan(plan_mean.reshape(shape))
         gaussian = Gaussian(start, torch.full_like(start, self.std_max))
 
+        weights_cast = self._cast_weights()
         if self.num_proposals:
             bounds = self.proposal_log_std_bounds
             proposals = propose_sequences(self.world_model, latent, noise.proposals, bounds)
@@ -310,13 +320,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         for iteration in range(self.iterations):
             actions = sample_sequences(gaussian, noise.candidates[:, iteration])
             if not self.num_proposals:
-                scores, returns = self._evaluate(latent, actions)
+                scores, returns = self._evaluate(latent, actions, weights_cast)
             elif iteration == 0:
                 actions = torch.cat([proposals, actions], dim=1)
-                scores, returns = self._evaluate(latent, actions)
+                scores, returns = self._evaluate(latent, actions, weights_cast)
                 proposal_scores, proposal_returns = (x[:, : self.num_proposals] for x in (scores, returns))
             else:  # the proposals keep the scores of the first iteration
-                scores, returns = self._evaluate(latent, actions)
+                scores, returns = self._evaluate(latent, actions, weights_cast)
                 actions = torch.cat([proposals, actions], dim=1)
                 scores = torch.cat([proposal_scores, scores], dim=1)
                 returns = torch.cat([proposal_returns, returns], dim=1)
@@ -359,10 +369,21 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         action = first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1]))
         return action.squeeze(1), scores.gather(1, index).squeeze(1)
 
-    def _evaluate(self, latent: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+    def _cast_weights(self) -> dict[str, Tensor] | None:
+        if self.scoring_dtype is None:
+            return None
+        return {name: weight.to(self.scoring_dtype) for name, weight in self._imagination.named_parameters()}
+
+    def _evaluate(
+        self, latent: Tensor, actions: Tensor, weights_cast: dict[str, Tensor] | None
+    ) -> tuple[Tensor, Tensor]:
         """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]`` from ``[B, L]``."""
-        all_depths = getattr(self.score, "depths", "all") != "last"
-        returns = imagined_returns(self.world_model, latent, actions, discount=self.discount, all_depths=all_depths)
+        options = {"discount": self.discount, "all_depths": getattr(self.score, "depths", "all") != "last"}
+        if weights_cast is None:
+            returns = self._imagination(latent, actions, **options)
+        else:
+            inputs = latent.to(self.scoring_dtype), actions.to(self.scoring_dtype)
+            returns = functional_call(self._imagination, weights_cast, inputs, options)
         scores = self.score(returns)
         if scores.shape != actions.shape[:2]:
             raise ValueError(
@@ -370,3 +391,14 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 f"{list(scores.shape)}."
             )
         return scores, returns
+
+
+class _Imagination(nn.Module):
+    """The return table as a module, so that it can be called with other weights."""
+
+    def __init__(self, world_model: nn.Module) -> None:
+        super().__init__()
+        self.world_model = world_model
+
+    def forward(self, latent: Tensor, actions: Tensor, *, discount: float, all_depths: bool) -> Tensor:
+        return imagined_returns(self.world_model, latent, actions, discount=discount, all_depths=all_depths)

@@ -104,6 +104,7 @@ def build_planner(
         first_action=config.first_action,
         eval_first_action=config.eval_first_action,
         warm_start=warm_start,
+        scoring_dtype=None if config.scoring_dtype == "float32" else torch.bfloat16,
         proposal_log_std_bounds=proposal_log_std_bounds,
     )
     if compile_mode is not None:

@@ -78,6 +78,8 @@ class PlannerConfig:
     std_max: float = 2.0
     first_action: str = "elite"
     eval_first_action: str = "best"
+    scoring_dtype: str = "float32"
+    """``bfloat16`` rolls and scores candidates in half precision; its effect on learning is not measured."""
 
     def __post_init__(self) -> None:
         group = "reanalyze" if isinstance(self, ReanalyzeConfig) else "planner"
@@ -103,6 +105,7 @@ class PlannerConfig:
         )
         for name in ("first_action", "eval_first_action"):
             _require_choice(f"{group}.{name}", getattr(self, name), ("elite", "mean", "best"))
+        _require_choice(f"{group}.scoring_dtype", self.scoring_dtype, ("float32", "bfloat16"))
 
 
 @dataclass(frozen=True)
