@@ -122,6 +122,7 @@ class TrainingRun:
         """
         if self.agent.compile_mode is None:
             return
+        torchrl_logger.info("compiling, which takes minutes the first time and seconds from PyTorch's cache later")
         tick = time.perf_counter()
         calls = 1 if self.agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
         try:
