@@ -22,6 +22,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from torchrl_etdmpc.analysis import read_runs
+
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
 TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch")
@@ -47,22 +49,17 @@ def run(task: str, seed: int, env_steps: int) -> str:
     return result.stdout.strip().splitlines()[-1].split(";")[0] + f" (seed {seed})"
 
 
-def collect() -> pd.DataFrame:
-    """All committed rows: task, seed, env_steps, return_mean."""
-    tables = []
-    for file in sorted(RESULTS.glob("*/seed*/eval.csv")):
-        table = pd.read_csv(file)
-        table["task"], table["seed"] = file.parent.parent.name, int(file.parent.name.removeprefix("seed"))
-        tables.append(table)
-    if not tables:
+def folders() -> list[Path]:
+    """The tasks with committed runs."""
+    found = sorted({file.parent.parent for file in RESULTS.glob("*/seed*/eval.csv")})
+    if not found:
         sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
-    return pd.concat(tables)
+    return found
 
 
 def write_report() -> None:
     """Beside the published curves, up to the budget of these runs."""
-    runs = sorted({str(file.parent.parent) for file in RESULTS.glob("*/seed*/eval.csv")})
-    command = [sys.executable, str(ROOT / "examples" / "report.py"), *runs, "--budget", str(ENV_STEPS)]
+    command = [sys.executable, str(ROOT / "examples" / "report.py"), *map(str, folders()), "--budget", str(ENV_STEPS)]
     subprocess.run([*command, "--grid-step", "10000", "--out", str(RESULTS / "report")], check=True)
 
 
@@ -88,7 +85,7 @@ def write_readme(table: pd.DataFrame) -> None:
         versions |= {json.dumps(summary["versions"], sort_keys=True) for summary in summaries}
         lines.append(
             f"| {task} | {int(rows.env_steps.max())} | {len(finals)} | {sum(finals) / len(finals):.0f} "
-            f"({', '.join(f'{value:.0f}' for value in finals)}) | {curve.max():.0f} at {curve.idxmax()} "
+            f"({', '.join(f'{value:.0f}' for value in finals)}) | {curve.max():.0f} at {curve.idxmax():.0f} "
             f"| {walls[0]:.1f} to {walls[-1]:.1f} | {speeds[0]:.0f} to {speeds[-1]:.0f} |"
         )
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
@@ -115,8 +112,7 @@ def main() -> None:
             runs = [(task, seed) for seed in arguments.seeds for task in arguments.tasks]
             for line in pool.map(lambda pair: run(*pair, arguments.env_steps), runs):
                 print(line, flush=True)
-    table = collect()
-    write_readme(table)
+    write_readme(read_runs(folders()))
     write_report()
 
 

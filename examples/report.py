@@ -54,6 +54,8 @@ def parse() -> argparse.Namespace:
         "--watch", nargs="?", type=float, const=30.0, metavar="SECONDS", help="refresh when new rows arrive, until ^C"
     )
     arguments = parser.parse_args()
+    if arguments.benchmark is not None:
+        get_benchmark(arguments.benchmark)  # a wrong name ends here, also when watching
     for name in ("budget", "grid_step", "watch"):
         value = getattr(arguments, name)
         if value is not None and value <= 0:
@@ -67,19 +69,18 @@ def named(argument: str) -> tuple[str | None, str]:
     return (name, path) if separator and not Path(argument).exists() else (None, argument)
 
 
-def read(arguments: argparse.Namespace) -> tuple[pd.DataFrame, list[pd.DataFrame]]:
-    """The runs' seed curves, and the tables of the baselines."""
+def read(arguments: argparse.Namespace) -> pd.DataFrame:
+    """The runs' seed curves."""
     groups: dict[str | None, list[str]] = {}
     for argument in arguments.runs:
         name, path = named(argument)
         groups.setdefault(name, []).append(path)
-    runs = join_curves(read_runs(paths, method=name) for name, paths in groups.items())
-    return runs, [read_curves(file) for file in arguments.reference]
+    return join_curves(read_runs(paths, method=name) for name, paths in groups.items())
 
 
-def report(arguments: argparse.Namespace) -> str:
+def report(arguments: argparse.Namespace, references: list[pd.DataFrame]) -> str:
     """Writes the report; returns a line for the terminal."""
-    runs, references = read(arguments)
+    runs = read(arguments)
     if runs.empty:
         raise ValueError("no evaluation in any of the runs yet; wait for the first row of eval.csv.")
     present = list(dict.fromkeys(runs["task"]))
@@ -124,15 +125,16 @@ def stamp(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
 def main() -> None:
     try:
         arguments = parse()
+        references = [read_curves(file) for file in arguments.reference]
         if arguments.watch is None:
-            print(report(arguments))
+            print(report(arguments, references))
             return
         seen = None
         while True:
             try:
                 now = stamp(arguments)
                 if now != seen:
-                    print(report(arguments), flush=True)
+                    print(report(arguments, references), flush=True)
                     seen = now
             except (ValueError, OSError) as error:  # a run that is just being made is complete the next time
                 print(f"waiting: {error}", file=sys.stderr, flush=True)

@@ -347,3 +347,8 @@ def test_the_line_on_the_terminal_names_what_was_compared(run_main, capfd):
     run_main("runs", "--budget", "100000", "--reference")
     line = "3 runs on 2 tasks of Easy DMC, up to 100,000 env steps; the report is report/index.md\n"
     assert re.fullmatch(re.escape(line), capfd.readouterr().out)
+
+
+def test_a_wrong_benchmark_ends_a_watch_before_it_begins(refused):
+    make_run("runs/a")
+    assert refused("runs", "--watch", "--benchmark", "atari").startswith("unknown benchmark 'atari'; choose one of ")
