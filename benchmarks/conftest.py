@@ -47,16 +47,20 @@ class Measure:
         call: Callable[[], object],
         *,
         rounds: int,
+        warmup_rounds: int = 2,
+        calls: int = 1,
         flop: int | None = None,
         baseline: str = "eager",
     ) -> None:
+        """Keeps the median time of ``call``, divided by how many ``calls`` of the case it makes."""
+
         def timed() -> None:
             call()
             if CUDA:
                 torch.cuda.synchronize()
 
-        self.benchmark.pedantic(timed, rounds=rounds, warmup_rounds=2)
-        median = self.benchmark.stats.stats.median
+        self.benchmark.pedantic(timed, rounds=rounds, warmup_rounds=warmup_rounds)
+        median = self.benchmark.stats.stats.median / calls
         row = {"case": case, "variant": variant, "threads": torch.get_num_threads(), "median_ms": 1000 * median}
         row["gflop"] = None if flop is None else flop / 1e9
         row["of_limit"] = None if flop is None else flop / 1e9 / median / self.limit

@@ -35,7 +35,7 @@ def small(**replay) -> TrainConfig:
     )
 
 
-@pytest.mark.parametrize("storage", ["cpu", "run"])
+@pytest.mark.parametrize("storage", ["cpu", "run", "auto"])
 def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
     from torchrl_etdmpc.envs import make_dmc_env
 
@@ -53,6 +53,23 @@ def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
     assert all(value.isfinite() and value.is_cuda for value in metrics.values())
     eval_env = env.append_transform(agent.eval_planner.make_tensordict_primer())
     assert evaluate(eval_env, agent.eval_planner, episodes=1, policy_device="cuda").isfinite().all()
+
+
+@pytest.mark.parametrize("compile_mode", ["off", "auto"])
+def test_an_update_never_waits_for_the_device(compile_mode):
+    config = dataclasses.replace(small(device="run"), compile=compile_mode)
+    agent = build_agent(config, 3, 1, "cuda")
+    replay = build_replay(config, "cuda")
+    rows = random_slices(3, 1, num_slices=20).reshape(-1)
+    rows["collector", "traj_ids"] = torch.arange(60) // 3
+    replay.extend(rows.to("cuda"))
+    for _ in range(3):  # compilation, and the sampler's first look at the rows
+        agent.updater.step(replay.sample().reshape(-1, 3))
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        agent.updater.step(replay.sample().reshape(-1, 3))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.parametrize("compile_mode", ["off", "default", "auto"])

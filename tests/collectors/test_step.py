@@ -28,7 +28,7 @@ from torchrl.envs import (
     TensorDictPrimer,
     TransformedEnv,
 )
-from torchrl.envs.utils import exploration_type
+from torchrl.envs.utils import RandomPolicy, exploration_type
 from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
 
 from torchrl_etdmpc import (
@@ -703,3 +703,25 @@ def test_no_gradient_is_recorded():
     policy = RandomActions(answer=lambda call, action: action * weight)
     (row,) = StepCollector(make_env(), policy, replay_buffer=make_replay(), total_frames=1)
     assert not row["action"].requires_grad
+
+
+def test_meanwhile_is_called_once_the_action_is_chosen_and_before_the_environment_steps():
+    seen = []
+    env, policy = LineEnv(), RandomPolicy(LineEnv().action_spec)
+    step = env._step
+
+    def observed_step(tensordict):
+        seen.append("step")
+        return step(tensordict)
+
+    def act(tensordict):
+        seen.append("act")
+        return policy(tensordict)
+
+    env._step = observed_step
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
+    collector = StepCollector(env, act, replay_buffer=buffer)
+    for number in range(3):
+        collector.step(lambda: seen.append((len(buffer), torch.is_grad_enabled())))
+        assert seen == ["act", (number, True), "step"]
+        seen.clear()

@@ -14,13 +14,16 @@ from torchrl_etdmpc.training import (
     Agent,
     TrainConfig,
     build_agent,
+    build_collector,
     build_planner,
     build_reanalyze,
     build_replay,
     build_world_model,
     preset,
     resolve_device,
+    row_bytes,
 )
+from torchrl_etdmpc.training.builders import replay_device
 from torchrl_etdmpc.training.config import PlannerConfig, ReanalyzeConfig
 
 OBSERVATION_DIM, ACTION_DIM = 5, 2
@@ -187,6 +190,37 @@ def test_the_buffer_holds_the_budget_and_no_more_than_its_capacity(changes, capa
     size = build_replay(config).storage.max_size
     allowance = config.num_envs if capacity < config.replay.capacity else 0
     assert capacity <= size <= capacity + allowance
+
+
+@pytest.mark.parametrize(
+    ("setting", "device", "needed", "expected"),
+    [
+        ("auto", "cuda:1", 50, "cuda:1"),
+        ("auto", "cuda:1", 51, "cpu"),  # more than half of what is free
+        ("run", "cuda:1", 51, "cuda:1"),
+        ("cpu", "cuda:1", 1, "cpu"),
+        ("auto", "cpu", 1, "cpu"),
+        ("run", "cpu", 10**12, "cpu"),
+    ],
+)
+def test_the_buffer_is_on_the_run_s_device_if_it_fits(monkeypatch, setting, device, needed, expected):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda which: (100, 1000) if which.index == 1 else (0, 1000))
+    config = tiny_config(replay={"device": setting})
+    assert replay_device(config, device, needed) == torch.device(expected)
+
+
+def test_a_row_has_the_bytes_that_the_rule_counts_with():
+    pytest.importorskip("dm_control")
+    from torchrl_etdmpc.envs import make_dmc_env
+
+    config = tiny_config(task="walker-walk")
+    env = make_dmc_env("walker-walk", seed=0)
+    replay = build_replay(config, sizes=(24, 6))
+    collector = build_collector(config, build_agent(config, 24, 6), env, replay)
+    for _ in range(3):
+        collector.step()
+    generation = 8  # an integer per row, kept by the writer
+    assert replay[:].bytes() / 3 == row_bytes(24, 6) - generation
 
 
 def test_a_sample_is_a_batch_of_slices():

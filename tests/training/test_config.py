@@ -94,7 +94,7 @@ UTD4 = {
     "replay.capacity": 1_000_000,
     "replay.insertion": "step",
     "replay.uniform_over": "episodes",
-    "replay.device": "cpu",
+    "replay.device": "auto",
     "replay.seed_decisions": None,  # max(1000, 5 episodes)
     "replay.pretrain_updates": None,  # as many as seed decisions
 }

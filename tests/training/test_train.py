@@ -215,6 +215,33 @@ def test_two_environments_keep_the_ratio_of_updates_to_decisions(tmp_path):
     assert (trajectories[1:40:2] == 1).all()
 
 
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_every_decision_of_every_environment_brings_its_share_of_reanalyze(tmp_path, num_envs):
+    run = make_run(tiny_config(num_envs=num_envs, reanalyze={"every": 4}, total_env_steps=200), tmp_path)
+    refreshed = []
+    run.reanalyze.refresh = lambda batch: refreshed.append(run.collector.frames) or batch
+    run.run()
+    learned = run.collector.frames - math.ceil(30 / num_envs) * num_envs
+    assert len(refreshed) == learned // 4
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_with_overlap_an_update_sees_the_data_of_the_decision_before(tmp_path, overlap):
+    run = make_run(tiny_config(overlap=overlap, num_envs=2, total_env_steps=122), tmp_path)
+    sizes = []
+    update = run.agent.updater.step
+
+    def watched(batch, *, distill):
+        if distill:
+            sizes.append(len(run.replay))
+        return update(batch, distill=distill)
+
+    run.agent.updater.step = watched
+    run.run()
+    before = range(30, run.collector.frames, 2)  # rows in the buffer when a step of two environments begins
+    assert sizes == [rows + (0 if overlap else 2) for rows in before for _ in range(4)]
+
+
 def test_a_transition_can_be_sampled_before_the_next_decision(tmp_path):
     run = make_run(tiny_config(), tmp_path)
     for number in range(1, 2 * EPISODE):

@@ -137,8 +137,13 @@ class StepCollector(BaseCollector):
         return self.iterator()
 
     @torch.no_grad()
-    def step(self) -> TensorDictBase:
-        """One decision of every environment: act, step, check, store."""
+    def step(self, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
+        """One decision of every environment: act, step, check, store.
+
+        Args:
+            meanwhile (callable, optional): called between acting and stepping, e.g. to queue an update on a GPU that
+                runs while the simulator does; it sees the buffer without this step.
+        """
         if self._carrier is None:
             self._carrier = self._start(self.env.reset())
         self._check_finite(self._carrier, self._checked_before, "the environment")  # a reset's are new here
@@ -146,6 +151,9 @@ class StepCollector(BaseCollector):
         with set_exploration_type(self.exploration_type):
             tensordict = self._act(self._carrier, seeding)
         self._check_finite(tensordict, self.env.action_keys, "the policy")
+        if meanwhile is not None:
+            with torch.enable_grad():
+                meanwhile()
         stepped, carrier = self.env.step_and_maybe_reset(tensordict)
         self._check_finite(stepped, self._checked_after, "the environment")
         rows = stepped.exclude(*self.exclude_keys).reshape(-1)

@@ -157,7 +157,7 @@ class StepSliceSampler(Sampler):
                 "LazyMemmapStorage(capacity) and write flat rows."
             )
         capacity = storage.max_size
-        newest = self._written - 1 if self._newest is None else int(self._newest)
+        newest = self._newest = self._written - 1 if self._newest is None else int(self._newest)  # waits once per write
         if len(storage) != min(self._written, capacity) or (newest + 1 - self._written) % capacity:
             raise RuntimeError(
                 f"the sampler saw {self._written} writes but the storage holds {len(storage)} of {capacity} rows; "

@@ -9,6 +9,7 @@ from torchrl_etdmpc.training.builders import (
     build_replay,
     build_world_model,
     resolve_device,
+    row_bytes,
 )
 from torchrl_etdmpc.training.checkpoint import CheckpointError, load_agent, read_checkpoint, save_checkpoint
 from torchrl_etdmpc.training.command_line import hydra_main, one_line_errors
@@ -47,6 +48,7 @@ __all__ = [
     "progress_bar",
     "read_checkpoint",
     "resolve_device",
+    "row_bytes",
     "save_checkpoint",
     "write_mp4",
 ]

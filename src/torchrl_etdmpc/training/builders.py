@@ -166,18 +166,47 @@ def build_agent(
     return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater, compile_mode)
 
 
-def build_replay(config: TrainConfig, device: torch.device | str = "cpu") -> TensorDictReplayBuffer:
+def row_bytes(observation_dim: int, action_dim: int) -> int:
+    """Bytes of one stored transition: observation before and after, action, reward, planner's target and labels."""
+    floats = 2 * observation_dim + 3 * action_dim + 3  # action, loc and scale; reward, its sum and the plan's value
+    integers = 4  # trajectory, model version, number and generation of the row
+    flags = 8  # done, terminated and truncated before and after; is_init after; fallback
+    return 4 * floats + 8 * integers + flags
+
+
+def replay_device(config: TrainConfig, device: torch.device | str, needed: int) -> torch.device:
+    """Where ``replay.device`` puts the storage.
+
+    Args:
+        config (TrainConfig): the run.
+        device (torch.device or str): the run's device.
+        needed (int): bytes of the full buffer.
+    """
+    device = torch.device(device)
+    if config.replay.device == "cpu" or device.type != "cuda":
+        return torch.device("cpu")
+    if config.replay.device == "run":
+        return device
+    free, _ = torch.cuda.mem_get_info(device)
+    return device if needed <= free / 2 else torch.device("cpu")
+
+
+def build_replay(
+    config: TrainConfig, device: torch.device | str = "cpu", *, sizes: tuple[int, int] = (0, 0)
+) -> TensorDictReplayBuffer:
     """The buffer: as many rows as the budget can fill, sampled by slices of ``loss.slice_len``.
 
     Args:
         config (TrainConfig): the run.
         device (torch.device or str): the run's device, where batches go. Default: ``"cpu"``.
+
+    Keyword Args:
+        sizes (tuple of int): O and A, for the rule of ``replay.device=auto``. Default: rows of no size, which fit.
     """
     decisions = math.ceil(config.total_env_steps / config.task_spec.action_repeat) + config.num_envs
+    rows = min(config.replay.capacity, decisions)
     return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(
-            min(config.replay.capacity, decisions), device=device if config.replay.device == "run" else "cpu"
-        ),
+        storage=LazyTensorStorage(rows, device=replay_device(config, device, rows * row_bytes(*sizes))),
         sampler=StepSliceSampler(config.loss.slice_len, uniform_over=config.replay.uniform_over),
         writer=TensorDictRoundRobinWriter(track_generations=True),
         batch_size=config.optim.batch_size * config.loss.slice_len,

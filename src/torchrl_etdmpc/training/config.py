@@ -189,8 +189,9 @@ class ReplayConfig:
     """Transitions; never more than the budget."""
     insertion: str = "step"
     uniform_over: str = "episodes"
-    device: str = "cpu"
-    """Where the storage lives: ``cpu``, or ``run`` for the run's device."""
+    device: str = "auto"
+    """Where the storage lives: ``cpu``; ``run``, the run's device; ``auto``, the run's device if the full buffer takes
+    at most half of its free memory."""
     seed_decisions: int | None = None
     """Decisions of uniform random actions. Default: max(1000, 5 episodes)."""
     pretrain_updates: int | None = None
@@ -204,7 +205,7 @@ class ReplayConfig:
         )
         _require_choice("replay.insertion", self.insertion, ("step", "episode"))
         _require_choice("replay.uniform_over", self.uniform_over, ("episodes", "starts"))
-        _require_choice("replay.device", self.device, ("cpu", "run"))
+        _require_choice("replay.device", self.device, ("auto", "cpu", "run"))
 
 
 @dataclass(frozen=True)
@@ -217,6 +218,8 @@ class TrainConfig:
     total_env_steps: int = 200_000
     run_dir: str | None = None
     num_envs: int = 1
+    overlap: bool = False
+    """Whether the simulator steps while the device updates, which makes the sampled data one decision older."""
     device: str = "auto"
     compile: str = "auto"
     logger: str = "none"

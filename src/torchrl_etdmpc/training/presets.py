@@ -45,10 +45,10 @@ PRESETS: dict[str, TrainConfig] = {
             total_env_steps=50_000,
             eval_every=10_000,
             threads=1,
-            model=ModelConfig(latent_dim=64, mlp_dim=96, encoder_dim=128, num_dynamics=2, activation="silu"),
+            model=ModelConfig(latent_dim=64, mlp_dim=64, encoder_dim=128, num_dynamics=2, activation="silu"),
             planner=PlannerConfig(horizon=3, num_samples=48, num_elites=10, num_proposals=4, iterations=3),
             reanalyze=ReanalyzeConfig(
-                num_samples=24, num_elites=6, num_proposals=2, iterations=3, every=5, num_slices=6
+                num_samples=24, num_elites=6, num_proposals=2, iterations=3, every=10, num_slices=6
             ),
             loss=LossConfig(tau=0.03),
             optim=OptimConfig(batch_size=64, lr=1e-3),

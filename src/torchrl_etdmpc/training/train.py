@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ from torchrl_etdmpc.training.builders import (
     build_reanalyze,
     build_replay,
     resolve_device,
+    row_bytes,
 )
 from torchrl_etdmpc.training.checkpoint import save_checkpoint
 from torchrl_etdmpc.training.config import TrainConfig
@@ -45,7 +47,9 @@ class TrainingRun:
         sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
         self.agent = build_agent(config, *sizes, self.device)
         self.eval_env = eval_env.append_transform(self.agent.eval_planner.make_tensordict_primer())
-        self.replay = build_replay(config, self.device)
+        self.replay = build_replay(config, self.device, sizes=sizes)
+        rows, where = self.replay.storage.max_size, self.replay.storage.device
+        torchrl_logger.info(f"replay: {rows:,} rows, {rows * row_bytes(*sizes) / 1e6:,.0f} MB when full, on {where}")
         self.reanalyze = build_reanalyze(config, self.agent, self.replay)
         self.collector = build_collector(config, self.agent, env, self.replay)
         self.action_repeat = config.task_spec.action_repeat
@@ -89,9 +93,11 @@ class TrainingRun:
                     self.evaluate()
                 while self.env_steps < config.total_env_steps:
                     tick = time.perf_counter()
-                    self.step()
-                    for _ in range(config.optim.updates_per_decision * config.num_envs):
-                        self.update()
+                    if config.overlap:
+                        self.step(meanwhile=self.updates)
+                    else:
+                        self.step()
+                        self.updates()
                     self._learning_s += time.perf_counter() - tick
                     last = self.env_steps >= config.total_env_steps
                     if last or self._passed(config.log_every):
@@ -167,15 +173,20 @@ class TrainingRun:
         rows["plan"] = {"loc": action, "scale": action + 1}
         self.agent.updater.warm_up(TensorDict(rows, slices))
 
-    def step(self) -> None:
-        """One decision of every environment."""
-        rows = self.collector.step()
+    def step(self, meanwhile: Callable[[], None] | None = None) -> None:
+        """One decision of every environment; ``meanwhile`` is called before the environments step."""
+        rows = self.collector.step(meanwhile)
         self._episode_returns.extend(rows["next", "episode_reward"][rows["next", "done"]].tolist())
 
     def update(self, *, distill: bool = True) -> None:
         """One gradient step on a fresh sample."""
         batch = self.replay.sample().to(self.device).reshape(-1, self.config.loss.slice_len)
         self._metrics.update(self.agent.updater.step(batch, distill=distill).items())
+
+    def updates(self) -> None:
+        """The updates that one decision of every environment calls for."""
+        for _ in range(self.config.optim.updates_per_decision * self.config.num_envs):
+            self.update()
 
     def pretrain(self) -> None:
         """Updates of world model and value on the seed data; the policy has nothing to learn from random actions."""

@@ -1,0 +1,105 @@
+"""Milliseconds per decision, everything included: environment, plan, update and the decision's share of reanalyze."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sized import DEVICE, VARIANTS, configure
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torchrl_etdmpc import StepCollector
+from torchrl_etdmpc.collectors import SeedPolicy
+from torchrl_etdmpc.envs import make_dmc_env
+from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun
+
+TASK = "walker-walk"
+# What a CPU can do in minutes; a GPU runs them all.
+ON_CPU = ["cpu", "efficient-tdmpc", "bmpc"]
+ON_GPU = [*ON_CPU, "efficient-tdmpc-utd2", "efficient-tdmpc-utd4"]
+
+
+def begin(config: TrainConfig, folder) -> TrainingRun:
+    """A run that has compiled, and has finished its seed phase and pretraining."""
+    parallel = DEVICE.type == "cuda"
+    env = make_dmc_env(config.task, seed=0, num_envs=config.num_envs, parallel=parallel)
+    eval_env = make_dmc_env(config.task, seed=1, num_envs=config.eval_episodes, parallel=False)
+    log = RunLog.create(folder / "run", config=config.to_dict(), total_env_steps=config.total_env_steps)
+    run = TrainingRun(config, env=env, eval_env=eval_env, log=log)
+    run.warm_up()
+    while run.collector.in_seed_phase:
+        run.step()
+    run.pretrain()
+    return run
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("num_envs", [1, 4, 16])
+@pytest.mark.parametrize("name", ON_GPU if DEVICE.type == "cuda" else ON_CPU)
+def test_decision(measure, tmp_path, name, num_envs, variant):
+    large = DEVICE.type == "cpu" and name != "cpu"
+    if large and (num_envs > 1 or variant != "eager"):
+        pytest.skip("takes too long on a CPU; the parts are measured apart")
+    config = configure(
+        name,
+        variant,
+        task=TASK,
+        num_envs=num_envs,
+        eval_episodes=1,
+        total_env_steps=1_000_000,
+        replay={"seed_decisions": 1000, "pretrain_updates": 1 if large else 20},
+    )
+    run = begin(config, tmp_path)
+    steps = config.reanalyze.every  # of all environments; every decision's share of reanalyze is in
+
+    def decide() -> None:
+        for _ in range(steps):
+            run.step()
+            run.updates()
+
+    before = run.agent.updater.updates, run.reanalyze.refreshed
+    if not large:
+        decide()
+        assert run.agent.updater.updates - before[0] == steps * num_envs * config.optim.updates_per_decision
+        assert run.reanalyze.refreshed > before[1]
+    environments = "one environment" if num_envs == 1 else f"{num_envs} environments"
+    try:
+        measure(
+            f"decision, {name}, {environments}",
+            variant,
+            decide,
+            rounds=1 if large else 20,
+            warmup_rounds=0 if large else 2,
+            calls=steps * num_envs,
+        )
+    finally:
+        run.collector.shutdown()
+        run.eval_env.close()
+
+
+@pytest.mark.parametrize("variant", ["simulator", "environment", "environment and collector"])
+def test_one_step_of_walker(measure, variant):
+    """One decision without planner: dm_control alone, the TorchRL environment, and the way into the buffer."""
+    env = make_dmc_env(TASK, seed=0)
+    raw = env.base_env._env
+    raw.reset()
+    still = np.zeros(6)
+
+    def simulate() -> None:
+        raw.step(still)
+        if raw.step(still).last():
+            raw.reset()
+
+    state = {"now": env.reset()}
+
+    def step() -> None:
+        now = state["now"].set("action", torch.zeros(6))
+        _, state["now"] = env.step_and_maybe_reset(now)
+
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000))
+    collector = StepCollector(env, SeedPolicy(env.action_spec), replay_buffer=buffer)
+    call = {"simulator": simulate, "environment": step, "environment and collector": collector.step}[variant]
+    call()
+    assert variant != "environment and collector" or len(buffer) == 1
+    measure("one step of walker", variant, call, rounds=400, warmup_rounds=50, baseline="simulator")
+    env.close()
