@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import shutil
 import warnings
 from pathlib import Path
@@ -70,6 +71,20 @@ def test_the_results_of_a_graph_that_is_replayed_outlive_the_next_call(monkeypat
     assert (first.tolist(), number) == ([1, 1], 7)
     borrowed, _ = compile_call(replayed, "reduce-overhead", keep=False)(3.0)
     assert borrowed is memory
+
+
+class Adder:
+    def __init__(self, amount: float) -> None:
+        self.amount = amount
+
+    def add(self, x: torch.Tensor) -> torch.Tensor:
+        return x + self.amount
+
+
+def test_one_process_compiles_as_many_agents_as_it_likes():
+    with torch._dynamo.config.patch(recompile_limit=2):
+        calls = [compile_call(Adder(amount).add, "default") for amount in range(4)]
+        assert [call(torch.zeros(1)).item() for call in calls] == [0, 1, 2, 3]
 
 
 def test_a_run_that_cannot_compile_goes_on_without_and_says_so_once(tmp_path, monkeypatch):
@@ -152,3 +167,13 @@ def test_a_compiled_update_equals_an_eager_one(warmed):
         fast_metrics, fast_gradients = compiled(*inputs[0])
     torch.testing.assert_close(fast_metrics, metrics, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(fast_gradients, gradients, rtol=1e-3, atol=1e-5)
+
+
+def test_a_compiled_plan_draws_the_random_numbers_of_an_eager_one(warmed):
+    planner = warmed[0].agent.planner
+    observation = torch.randn(planner.world_model.observation_dim)
+    plans = []
+    for plan in (planner.plan, functools.partial(type(planner).plan, planner)):
+        torch.manual_seed(3)
+        plans.append(plan(observation))
+    torch.testing.assert_close(plans[0].action, plans[1].action, atol=1e-4, rtol=1e-4)

@@ -354,7 +354,7 @@ REFUSED = [
     ),
     ({"replay__insertion": "batch"}, "replay.insertion must be one of step, episode, got 'batch'."),
     ({"replay__uniform_over": "rows"}, "replay.uniform_over must be one of episodes, starts, got 'rows'."),
-    ({"replay__device": "cuda"}, "replay.device must be one of cpu, run, got 'cuda'."),
+    ({"replay__device": "cuda"}, "replay.device must be one of auto, cpu, run, got 'cuda'."),
     ({"replay__pretrain_updates": -1}, "replay.pretrain_updates must not be negative, got -1."),
     (
         {"replay__seed_decisions": 5, "num_envs": 2},

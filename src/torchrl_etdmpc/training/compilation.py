@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import shutil
+import types
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -39,6 +41,7 @@ def compile_call(function: Callable[..., Any], mode: str, *, keep: bool = True) 
         keep (bool): whether results must outlive the next call. CUDA graphs write them to the same memory every time,
             so they are copied. Default: ``True``.
     """
+    function = _with_code_of_its_own(function)
     if mode == "default":  # PyTorch's own random numbers: those of an eager run, and faster on a CPU than Inductor's
         return torch.compile(function, options={"fallback_random": True}, dynamic=False, fullgraph=True)
     compiled = torch.compile(function, mode=mode, dynamic=False, fullgraph=True)
@@ -50,3 +53,20 @@ def compile_call(function: Callable[..., Any], mode: str, *, keep: bool = True) 
         return tree_map_only(torch.Tensor, torch.clone, result) if keep else result
 
     return replay
+
+
+_numbers = itertools.count()
+
+
+def _with_code_of_its_own(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function to call, a new one to Dynamo, which refuses the ninth compilation of one code object.
+
+    All planners share the code of ``plan``, and a process may make many agents.
+    """
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return function(*args, **kwargs)
+
+    name = f"{function.__name__}_{next(_numbers)}"
+    code = call.__code__.replace(co_name=name)
+    return functools.update_wrapper(types.FunctionType(code, globals(), name, None, call.__closure__), function)
