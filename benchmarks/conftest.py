@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 import statistics
 import sys
 import time
@@ -25,6 +26,13 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[ROWS] = []
     torch.set_num_threads(1)
     torch.set_float32_matmul_precision("high")
+
+
+def processor() -> str:
+    """The CPU's name where the system tells it."""
+    file = Path("/proc/cpuinfo")
+    names = re.findall(r"^model name\s*: (.+)$", file.read_text(), re.M) if file.exists() else []
+    return f"{platform.machine()} ({names[0]})" if names else platform.machine()
 
 
 class Measure:
@@ -96,7 +104,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         return
     file = RESULTS / "speed.json"
     about = {
-        "device": torch.cuda.get_device_name() if CUDA else platform.machine(),
+        "device": torch.cuda.get_device_name() if CUDA else processor(),
         "versions": {"python": platform.python_version()}
         | {name: version(name) for name in ("torch", "torchrl", "tensordict")},
     }
@@ -123,3 +131,22 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         cells += ["" if row["ratio"] is None else f"{row['ratio']:.2f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     (RESULTS / "speed.md").write_text("\n".join(lines) + "\n")
+    write_plan_table()
+
+
+def write_plan_table() -> None:
+    """The plans of every size on every device that was measured, in ``benchmarks/README.md``."""
+    pattern = re.compile(r"plan of (\d+), (\d) heads, horizon (\d), (\d+) samples")
+    lines = ["| device | variant | states | heads | horizon | samples | ms | ms per state | of the limit |"]
+    lines += ["|---" * 9 + "|"]
+    for file in sorted(RESULTS.parent.glob("*/speed.json")):
+        for row in json.loads(file.read_text()):
+            if match := pattern.fullmatch(row["case"]):
+                sizes = [int(number) for number in match.groups()]
+                milliseconds = [f"{row['median_ms']:.3g}", f"{row['median_ms'] / sizes[0]:.3g}"]
+                cells = [row["device"], row["variant"], *sizes, *milliseconds, f"{row['of_limit']:.2f}"]
+                lines.append("| " + " | ".join(map(str, cells)) + " |")
+    readme = Path(__file__).parent / "README.md"
+    begin, end = "<!-- plan table: written by make bench -->\n", "<!-- end -->"
+    head, rest = readme.read_text().split(begin)
+    readme.write_text(head + begin + "\n".join(lines) + "\n" + rest[rest.index(end) :])

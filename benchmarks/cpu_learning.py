@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -38,21 +39,28 @@ SEEDS = (1, 2, 3)
 REPORT_ENV_STEPS = 50_000  # up to which the report compares all tasks
 
 
-def run(task: str, seed: int, env_steps: int) -> str:
-    """One run in a process of its own; returns a line for the terminal."""
-    target = RESULTS / task / f"seed{seed}"
+def run(
+    task: str,
+    seed: int,
+    env_steps: int,
+    *overrides: str,
+    target: Path | None = None,
+    keep: Sequence[str] = ("eval.csv", "summary.json"),
+) -> str:
+    """One run in a process of its own, of which ``keep`` goes to ``target``; returns a line for the terminal."""
+    target = target or RESULTS / task / f"seed{seed}"
     if (target / "summary.json").exists():
         return f"{task} seed {seed}: already there"
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
         command = [sys.executable, str(ROOT / "examples" / "train_dmc.py"), "preset=cpu", f"task={task}"]
-        command += [f"seed={seed}", f"total_env_steps={env_steps}", f"run_dir={run_dir}"]
+        command += [f"seed={seed}", f"total_env_steps={env_steps}", f"run_dir={run_dir}", *overrides]
         result = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
         if result.returncode:
             return f"{task} seed {seed}: failed: {result.stderr.strip().splitlines()[-1]}"
         target.mkdir(parents=True, exist_ok=True)
-        for name in ("eval.csv", "summary.json"):
-            shutil.copy(run_dir / name, target / name)
+        for name in keep:
+            shutil.copy(run_dir / name, target / Path(name).name)
     return result.stdout.strip().splitlines()[-1].split(";")[0] + f" (seed {seed})"
 
 

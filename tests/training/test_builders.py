@@ -281,11 +281,11 @@ def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compil
     assert compiled == []
 
 
-def test_on_a_cpu_the_update_and_the_planners_of_the_training_loop_are_compiled_and_nothing_else(compiled):
+def test_the_update_and_every_planner_are_compiled_and_nothing_else(compiled):
     agent = tiny_agent(compile="default")
     owners = [function.__wrapped__.__self__ for function, _ in compiled]
-    assert owners == [agent.updater, agent.planner, agent.reanalyze_planner]
-    assert [function.__name__ for function, _ in compiled] == ["_gradients", "plan", "plan"]
+    assert owners == [agent.updater, agent.planner, agent.eval_planner, agent.reanalyze_planner]
+    assert [function.__name__ for function, _ in compiled] == ["_gradients", "plan", "plan", "plan"]
     assert all(options == COMPILE_OPTIONS for _, options in compiled)
 
 

@@ -125,8 +125,6 @@ def build_agent(
     """
     device = torch.device(device)
     compile_mode = resolve_compile(config.compile, device)
-    # The few evaluations of a run on a CPU do not earn back their compilation.
-    eval_mode = compile_mode if device.type == "cuda" else None
     discount = config.loss.discount
     if discount is None:
         discount = discount_from_episode_length(config.task_spec.decision_steps_per_episode)
@@ -153,7 +151,7 @@ def build_agent(
     )
     planner = build_planner(world_model, config.planner, discount=discount, warm_start=True, compile_mode=compile_mode)
     eval_planner = build_planner(
-        world_model, config.planner, discount=discount, warm_start=True, compile_mode=eval_mode
+        world_model, config.planner, discount=discount, warm_start=True, compile_mode=compile_mode
     )
     reanalyze_planner = build_planner(
         world_model,

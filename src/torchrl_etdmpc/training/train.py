@@ -162,9 +162,8 @@ class TrainingRun:
             if self.reanalyze is not None:
                 rows = config.reanalyze.num_slices * config.loss.slice_len
                 self.agent.reanalyze_planner(states(rows).select("observation"))
-        if self.device.type == "cuda":
-            with set_exploration_type(ExplorationType.DETERMINISTIC):
-                self.agent.eval_planner(states(*self.eval_env.batch_size))
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            self.agent.eval_planner(states(*self.eval_env.batch_size))
         slices = config.optim.batch_size, config.loss.slice_len
         action = zeros(*slices, model.action_dim)
         following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
