@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
+
+from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 
 TRAJ_KEY = ("collector", "traj_ids")
 
@@ -239,14 +242,43 @@ class StepCollector(BaseCollector):
         self.closed = True
 
     def state_dict(self) -> OrderedDict:
-        """Counters: decisions made and the next trajectory id (neither the policy nor the simulator)."""
-        return OrderedDict(frames=self._frames, next_trajectory=self._next_trajectory)
+        """Counters and the place inside the running episodes, the simulator's included (not the policy's weights).
+
+        Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)`` reads them.
+        """
+        return OrderedDict(
+            frames=self._frames,
+            next_trajectory=self._next_trajectory,
+            simulator=simulator_state(self.env),
+            carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
+            pending=[[row.to_dict() for row in rows] for rows in self._pending],
+        )
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
-        """Restores the counters; collection goes on with a fresh episode and a fresh trajectory id."""
+        """Restores :meth:`state_dict`; collection goes on inside the episodes that were running.
+
+        Where the environment cannot be brought back (:func:`~torchrl_etdmpc.envs.simulator_state`), fresh episodes with
+        fresh trajectory ids begin, and a warning says so.
+        """
         self._frames = state_dict["frames"]
         self._next_trajectory = state_dict["next_trajectory"]
         self._abandon_episodes()
+        if state_dict.get("simulator") is None:
+            if self._frames:
+                warnings.warn("the environment cannot be restored, so fresh episodes begin.", stacklevel=2)
+            return
+        if not load_simulator_state(self.env, state_dict["simulator"]):
+            warnings.warn(
+                "the simulator did not come back to where it was (another version or processor?), so fresh episodes "
+                "begin.",
+                stacklevel=2,
+            )
+            return
+        if state_dict["carrier"] is None:  # between episodes
+            return
+        batch_size, device = self.env.batch_size, self.env.device
+        self._carrier = TensorDict(state_dict["carrier"], batch_size, device=device)
+        self._pending = [[TensorDict(row, [], device=device) for row in rows] for rows in state_dict["pending"]]
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(num_envs={self.num_envs}, frames={self._frames}, insertion={self.insertion!r})"

@@ -28,6 +28,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from torchrl_etdmpc.envs.episode import EpisodeState, RecordedDMControlEnv
 from torchrl_etdmpc.envs.tasks import Task, get_task
 
 __all__ = ["make_dmc_env", "render_frame"]
@@ -160,7 +161,7 @@ def render_frame(env: EnvBase, height: int = 384, width: int = 384, *, camera_id
 
 def _make_one(task: Task, device: torch.device | str) -> TransformedEnv:
     with _quiet_dm_control():
-        base = DMControlEnv(
+        base = RecordedDMControlEnv(
             task.domain,
             task.task,
             frame_skip=task.action_repeat,
@@ -178,7 +179,9 @@ def _make_one(task: Task, device: torch.device | str) -> TransformedEnv:
     if not ((bounds.low == -1).all() and (bounds.high == 1).all()):
         # Before DoubleToFloat: on the way in, transforms apply from last to first, so this one scales in float64.
         transforms.insert(0, ActionScaling())
-    return TransformedEnv(base, Compose(*transforms))
+    env = TransformedEnv(base, Compose(EpisodeState(), *transforms))
+    _ = env.action_spec  # ActionScaling reads its bounds now, and its state can be loaded at any time
+    return env
 
 
 def _require_dm_control() -> None:
