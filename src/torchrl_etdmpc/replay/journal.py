@@ -1,0 +1,221 @@
+"""A replay buffer on disk, written in steps whose cost is what is new."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import secrets
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_etdmpc.replay.reanalyze import TARGETS
+
+__all__ = ["DamagedFileError", "ReplayJournal", "read_checked", "write_checked"]
+
+ROWS_PER_FILE = 16_384
+
+
+class DamagedFileError(RuntimeError):
+    """A file of a checkpoint that is missing or is not what was written."""
+
+
+class ReplayJournal:
+    """Writes a buffer's rows once, and the planner targets that reanalyze rewrites as a base with changes.
+
+    A transition never changes except for its targets. So every :meth:`save` appends a file with the rows written since
+    the last one, and a file with the targets computed since then; when those changes exceed a quarter of the buffer,
+    all targets are written anew. Files are never modified. What belongs to one state of the buffer is listed in the
+    dictionary that :meth:`save` returns; several such lists share files, and :meth:`prune` removes what no list names.
+
+    The buffer must be written in order (``add`` and ``extend``, one storage dimension), as
+    :class:`~torchrl_etdmpc.collectors.StepCollector` does.
+
+    Args:
+        folder (str or Path): made if missing.
+
+    Keyword Args:
+        plan_key (NestedKey): group of the planner's targets, with the model version that they were computed by. Rows
+            without it are written once and never again. Default: ``"plan"``.
+        rewrite_at (float): share of changed targets at which all of them are written. Default: 0.25.
+
+    >>> import tempfile
+    >>> from torchrl.data import LazyTensorStorage
+    >>> def buffer():
+    ...     return TensorDictReplayBuffer(storage=LazyTensorStorage(10))
+    >>> first, second = buffer(), buffer()
+    >>> _ = first.extend(TensorDict({"x": torch.arange(7)}, [7]))
+    >>> journal = ReplayJournal(tempfile.mkdtemp())
+    >>> files = journal.save(first)
+    >>> journal.load(second, files)
+    >>> second[:]["x"].tolist()
+    [0, 1, 2, 3, 4, 5, 6]
+    """
+
+    def __init__(self, folder: str | Path, *, plan_key: NestedKey = "plan", rewrite_at: float = 0.25) -> None:
+        self.folder = Path(folder)
+        self.rewrite_at = rewrite_at
+        self._target_keys = [unravel_key((plan_key, name)) for name in TARGETS]
+        self._version_key = unravel_key((plan_key, "version"))
+        self._state: dict[str, Any] = {"written": 0, "version": 0, "rows": [], "targets": []}
+
+    def save(self, buffer: TensorDictReplayBuffer, *, version: int = 0) -> dict[str, Any]:
+        """Writes what is new.
+
+        Args:
+            buffer (TensorDictReplayBuffer): the same one at every call.
+
+        Keyword Args:
+            version (int): the model's version now; targets computed from now on carry at least this one.
+
+        Returns:
+            dict: what :meth:`load` needs, JSON-serialisable.
+
+        Raises:
+            OSError: if a file cannot be written; the journal stays as it was.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        capacity, written = buffer.storage.max_size, buffer.writer._write_count
+        old = self._state
+        new = {"capacity": capacity, "written": written, "version": version}
+        new["rows"] = [entry for entry in old["rows"] if entry["end"] > written - capacity]
+        new["targets"] = old["targets"]
+        if written:
+            stored = buffer.storage[:]
+            targets = [key for key in self._target_keys if key in stored.keys(True, True)]
+            begin = max(old["written"], written - capacity)
+            for start in range(begin, written, ROWS_PER_FILE):
+                end = min(start + ROWS_PER_FILE, written)
+                rows = stored.exclude(*targets)[torch.arange(start, end, device=stored.device) % capacity]
+                entry = self._write(f"rows-{start:012d}", rows)
+                new["rows"] = [*new["rows"], entry | {"begin": start, "end": end}]
+            if targets:
+                new["targets"] = self._save_targets(stored.select(*targets), old, begin, written, capacity)
+        self._state = new
+        return new
+
+    def _save_targets(
+        self, stored: TensorDictBase, old: dict[str, Any], begin: int, written: int, capacity: int
+    ) -> list[dict[str, Any]]:
+        changed = stored.get(self._version_key).reshape(len(stored)) >= old["version"]
+        changed[torch.arange(begin, written, device=changed.device) % capacity] = True
+        index = changed.nonzero().squeeze(-1)
+        pending = sum(entry["rows"] for entry in old["targets"][1:]) + len(index)
+        whole = not old["targets"] or pending > self.rewrite_at * len(stored)
+        if whole:
+            index = torch.arange(len(stored), device=changed.device)
+        content = stored[index].set("index", index)
+        entry = self._write(f"targets-{written:012d}", content) | {"rows": len(index)}
+        return [entry] if whole else [*old["targets"], entry]
+
+    def _write(self, name: str, content: TensorDictBase) -> dict[str, Any]:
+        # A run that goes on from an older state must not meet the files of the future that it lost.
+        file = f"{name}-{secrets.token_hex(4)}.pt"
+        return {"file": file, "sha256": write_checked(self.folder / file, content.cpu().to_dict())}
+
+    def load(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> None:
+        """Fills an empty buffer, and goes on from there at the next :meth:`save`.
+
+        Args:
+            buffer (TensorDictReplayBuffer): with the capacity of the saved one, or a larger one if the saved one was
+                not full yet.
+            files (mapping): what :meth:`save` returned.
+
+        Raises:
+            ValueError: if the capacity does not fit.
+            DamagedFileError: if a file is missing or has changed.
+        """
+        capacity, written = buffer.storage.max_size, files["written"]
+        if capacity != files["capacity"] and (capacity < written or written > files["capacity"]):
+            raise ValueError(
+                f"the saved buffer has capacity {files['capacity']} and {written} rows were written to it; it cannot "
+                f"be loaded into one of capacity {capacity}."
+            )
+        if written:
+            rows = torch.cat([self._read(entry) for entry in files["rows"]])
+            first = files["rows"][0]["begin"]
+            rows = rows[
+                max(written - files["capacity"], 0) - first :
+            ]  # the oldest file may hold rows overwritten since
+            position = torch.arange(written - len(rows), written) % capacity
+            content: TensorDict | None = None
+            for entry in files["targets"]:
+                change = self._read(entry)
+                index = change.pop("index")
+                if content is None:
+                    content = change.new_zeros(len(rows))
+                content[index] = change
+            if content is not None:
+                rows = rows.update(content[position])
+            buffer.storage.set(position.to(_device(buffer)), rows.to(_device(buffer)))
+            state = {"_cursor": written % capacity, "_write_count": written}
+            if buffer.writer.tracks_generations:  # how often each row has been written, from 0; -1 for never
+                times = (written - 1 - torch.arange(capacity)).div(capacity, rounding_mode="floor")
+                state["_generation"] = times.clamp(min=-1)
+            buffer.writer.load_state_dict(state)
+        self._state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
+
+    def _read(self, entry: Mapping[str, Any]) -> TensorDict:
+        content = read_checked(self.folder / entry["file"], entry["sha256"])
+        return TensorDict(content, [len(next(iter(_leaves(content))))])
+
+    def prune(self, kept: Iterable[Mapping[str, Any]]) -> None:
+        """Removes the files that none of the lists names.
+
+        Args:
+            kept (iterable of mapping): what :meth:`save` returned, for every state that should stay loadable.
+        """
+        named = {entry["file"] for files in kept for part in ("rows", "targets") for entry in files[part]}
+        for file in self.folder.glob("*.pt"):
+            if file.name not in named:
+                file.unlink(missing_ok=True)
+
+
+def write_checked(path: Path, content: Any) -> str:
+    """Writes tensors and plain containers, safe against a power cut; returns the file's SHA-256."""
+    memory = io.BytesIO()
+    torch.save(content, memory)
+    data = memory.getbuffer()
+    try:
+        with path.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    return hashlib.sha256(data).hexdigest()
+
+
+def read_checked(path: Path, sha256: str) -> Any:
+    """Reads a file of :func:`write_checked` without running any code in it.
+
+    Raises:
+        DamagedFileError: if it is missing, has changed or holds something else.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DamagedFileError(f"{path} cannot be read ({error.strerror}).") from error
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise DamagedFileError(f"{path} is not the file that was written: it is cut off or damaged.")
+    try:
+        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # the errors of hostile files advise to run their code
+        raise DamagedFileError(f"{path} holds more than tensors and plain containers; it was not loaded.") from error
+
+
+def _leaves(content: Mapping[str, Any]) -> Iterable[Tensor]:
+    for value in content.values():
+        yield from _leaves(value) if isinstance(value, Mapping) else (value,)
+
+
+def _device(buffer: TensorDictReplayBuffer) -> torch.device | str:
+    device = buffer.storage.device
+    return "cpu" if device == "auto" else device

@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+import json
+import os
+import pickle
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
+
+from torchrl_etdmpc.replay import journal as module
+from torchrl_etdmpc.replay.journal import DamagedFileError, ReplayJournal, read_checked, write_checked
+
+
+def make_buffer(capacity: int = 50) -> TensorDictReplayBuffer:
+    writer = TensorDictRoundRobinWriter(track_generations=True)
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), writer=writer, batch_size=4)
+
+
+class Pipeline:
+    """Writes rows and re-plans old ones, as a training run does; the model's version grows by one a step."""
+
+    def __init__(self, buffer: TensorDictReplayBuffer, observation_dim: int = 3) -> None:
+        self.buffer, self.observation_dim, self.version, self.rows = buffer, observation_dim, 0, 0
+
+    def write(self, count: int) -> None:
+        numbers = torch.arange(self.rows, self.rows + count)
+        plan = {"loc": torch.randn(count, 2), "scale": torch.rand(count, 2), "value": torch.randn(count, 1)}
+        plan["version"] = torch.full((count, 1), self.version)
+        plan["fallback"] = torch.zeros(count, 1, dtype=torch.bool)
+        rows = {"observation": torch.randn(count, self.observation_dim), "number": numbers, "plan": plan}
+        self.buffer.extend(TensorDict(rows | {"next": {"done": numbers.unsqueeze(-1) % 7 == 0}}, [count]))
+        self.rows += count
+        self.version += 1
+
+    def refresh(self, count: int) -> None:
+        index = torch.randperm(len(self.buffer))[:count]
+        patch = {("plan", "loc"): torch.randn(len(index), 2), ("plan", "scale"): torch.rand(len(index), 2)}
+        patch |= {("plan", "value"): torch.randn(len(index), 1)}
+        patch |= {("plan", "version"): torch.full((len(index), 1), self.version)}
+        self.buffer.update_if_present(index=index, generation=self.buffer.writer.generations_of(index), patch=patch)
+        self.version += 1
+
+
+def assert_same(buffer: TensorDictReplayBuffer, other: TensorDictReplayBuffer) -> None:
+    assert len(buffer) == len(other)
+    if len(buffer):
+        assert (buffer.storage[:] == other.storage[:]).all()
+        assert set(buffer.storage[:].keys(True, True)) == set(other.storage[:].keys(True, True))
+    state, wanted = other.writer.state_dict(), buffer.writer.state_dict()
+    assert {key: torch.as_tensor(value).tolist() for key, value in state.items()} == {
+        key: torch.as_tensor(value).tolist() for key, value in wanted.items()
+    }
+
+
+STEPS = st.lists(st.tuples(st.sampled_from(["write", "refresh", "save", "reload"]), st.integers(1, 12)), max_size=25)
+
+
+@settings(max_examples=60, deadline=None)
+@given(steps=STEPS, capacity=st.integers(5, 40), rewrite_at=st.sampled_from([0.0, 0.25, 10.0]))
+def test_what_is_loaded_is_what_was_saved(tmp_path_factory, steps, capacity, rewrite_at):
+    folder = tmp_path_factory.mktemp("journal")
+    run, journal = Pipeline(make_buffer(capacity)), ReplayJournal(folder, rewrite_at=rewrite_at)
+    run.write(3)
+    for action, number in [*steps, ("save", 0)]:
+        if action == "save":
+            files = json.loads(json.dumps(journal.save(run.buffer, version=run.version)))
+            copy = make_buffer(capacity)
+            ReplayJournal(folder).load(copy, files)
+            assert_same(run.buffer, copy)
+        elif action == "reload":  # a run that goes on from its last state, in a new process
+            files = journal.save(run.buffer, version=run.version)
+            journal, copy = ReplayJournal(folder, rewrite_at=rewrite_at), make_buffer(capacity)
+            journal.load(copy, files)
+            run.buffer = copy
+        else:
+            getattr(run, action)(number)
+
+
+def test_older_states_stay_loadable_until_they_are_pruned(tmp_path):
+    run, journal = Pipeline(make_buffer(30)), ReplayJournal(tmp_path)
+    states = []
+    for _ in range(5):
+        run.write(9)
+        run.refresh(4)
+        states.append((journal.save(run.buffer, version=run.version), run.buffer.storage[:].clone()))
+    for files, wanted in states:
+        copy = make_buffer(30)
+        ReplayJournal(tmp_path).load(copy, files)
+        assert (copy.storage[:] == wanted).all()
+    journal.prune([states[-1][0]])
+    assert {file.name for file in tmp_path.iterdir()} == {
+        entry["file"] for part in ("rows", "targets") for entry in states[-1][0][part]
+    }
+    copy = make_buffer(30)
+    ReplayJournal(tmp_path).load(copy, states[-1][0])
+    assert_same(run.buffer, copy)
+    with pytest.raises(DamagedFileError):
+        ReplayJournal(tmp_path).load(make_buffer(30), states[0][0])
+
+
+def test_a_save_writes_what_is_new_and_not_the_buffer(tmp_path):
+    run, journal = Pipeline(make_buffer(5000)), ReplayJournal(tmp_path)
+    run.write(4000)
+    journal.save(run.buffer, version=run.version)
+    before = {file: file.stat().st_size for file in tmp_path.iterdir()}
+    run.write(10)
+    run.refresh(20)
+    files = journal.save(run.buffer, version=run.version)
+    added = sum(file.stat().st_size for file in tmp_path.iterdir() if file not in before)
+    assert added < 0.05 * sum(before.values())
+    assert all(file.stat().st_size == size for file, size in before.items())
+    assert [entry["rows"] for entry in files["targets"]] == [4000, pytest.approx(30, abs=10)]
+
+
+def test_many_changes_are_gathered_so_that_the_files_stay_about_as_large_as_the_buffer(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "ROWS_PER_FILE", 1000)
+    run, journal = Pipeline(make_buffer(20_000), observation_dim=48), ReplayJournal(tmp_path)
+    run.write(20_000)
+    for _ in range(30):
+        run.refresh(1500)
+        run.write(250)
+        files = journal.save(run.buffer, version=run.version)
+        journal.prune([files])
+    size = sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert size < 1.2 * run.buffer.storage[:].bytes()
+
+
+def test_a_large_buffer_is_split_into_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "ROWS_PER_FILE", 16)
+    run, journal = Pipeline(make_buffer(100)), ReplayJournal(tmp_path)
+    run.write(70)
+    files = journal.save(run.buffer)
+    assert [(entry["begin"], entry["end"]) for entry in files["rows"]] == [
+        (0, 16),
+        (16, 32),
+        (32, 48),
+        (48, 64),
+        (64, 70),
+    ]
+    copy = make_buffer(100)
+    ReplayJournal(tmp_path).load(copy, files)
+    assert_same(run.buffer, copy)
+
+
+@pytest.mark.parametrize(("written", "capacity", "fits"), [(8, 30, True), (8, 7, False), (12, 30, False)])
+def test_a_buffer_that_was_not_full_fits_into_a_larger_one(tmp_path, written, capacity, fits):
+    run = Pipeline(make_buffer(10))
+    run.write(written)
+    files = ReplayJournal(tmp_path).save(run.buffer)
+    copy = make_buffer(capacity)
+    if fits:
+        ReplayJournal(tmp_path).load(copy, files)
+        assert (copy.storage[:] == run.buffer.storage[:]).all()
+        return
+    with pytest.raises(ValueError, match=rf"^the saved buffer has capacity 10 and {written} rows were written to it"):
+        ReplayJournal(tmp_path).load(copy, files)
+
+
+def damage(path, how: str) -> None:
+    data = bytearray(path.read_bytes())
+    if how == "missing":
+        path.unlink()
+    elif how == "cut off":
+        path.write_bytes(data[: len(data) // 2])
+    elif how == "a flipped bit":
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize("how", ["missing", "cut off", "a flipped bit"])
+@pytest.mark.parametrize("part", ["rows", "targets"])
+def test_a_damaged_file_is_named(tmp_path, part, how):
+    run = Pipeline(make_buffer())
+    run.write(20)
+    files = ReplayJournal(tmp_path).save(run.buffer)
+    file = tmp_path / files[part][0]["file"]
+    damage(file, how)
+    with pytest.raises(DamagedFileError, match=file.name):
+        ReplayJournal(tmp_path).load(make_buffer(), files)
+
+
+class Hostile:
+    def __reduce__(self):
+        return os.system, ("touch hostile_code_ran",)
+
+
+def test_a_file_that_holds_code_is_refused_even_if_its_checksum_is_right(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for content in (pickle.dumps(Hostile()), None):
+        path = tmp_path / f"file{content is None}.pt"
+        if content is None:
+            sha256 = write_checked(path, {"rows": Hostile()})
+        else:
+            path.write_bytes(content)
+            sha256 = module.hashlib.sha256(content).hexdigest()
+        with pytest.raises(DamagedFileError, match="holds more than tensors"):
+            read_checked(path, sha256)
+    assert not (tmp_path / "hostile_code_ran").exists()
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing_and_the_journal_as_it_was(tmp_path, monkeypatch):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10)
+    first = journal.save(run.buffer, version=run.version)
+    run.write(10)
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        journal.save(run.buffer, version=run.version)
+    monkeypatch.undo()
+    assert {file.name for file in tmp_path.iterdir()} == {e["file"] for p in ("rows", "targets") for e in first[p]}
+    copy = make_buffer()
+    ReplayJournal(tmp_path).load(copy, journal.save(run.buffer, version=run.version))
+    assert_same(run.buffer, copy)
