@@ -186,7 +186,7 @@ REFUSED = [
     (["total_env_steps=5000"], "total_env_steps must exceed the seed phase of 5000 env steps, got 5000; raise "),
     (["replay.capacity=2"], "replay.capacity must be at least 6 with these settings, got 2."),
     (["num_envs=0"], "num_envs must be at least 1, got 0."),
-    (["resume=true"], "resume is not implemented yet; start a new run_dir"),
+    (["resume=true"], "run_dir=runs/walker-walk/efficient-tdmpc/seed1 holds no run to go on with; start it with "),
     (["logger=wandb"], "logger=wandb needs wandb, which is not installed; run `pip install torchrl_etdmpc[wandb]`."),
     (["device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."),
     (["device=cuda:first"], "Invalid device string: 'cuda:first'"),

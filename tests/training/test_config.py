@@ -246,7 +246,7 @@ def test_a_number_or_switch_may_be_written_in_its_natural_way(written, name, mea
         ({"eval_policy": 1}, "eval_policy must be of type bool, got 1."),
         ({"task": None}, "task must be of type str, got None."),
         ({"run_dir": 7}, "run_dir must be of type str, got 7."),
-        ({"resume": "auto"}, "resume must be of type bool, got 'auto'."),
+        ({"resume": 1}, "resume must be of type str, got 1."),
         ({"planner": 3}, "planner must be a group of settings, got 3."),
         ({"optim__lr": "fast"}, "optim.lr must be of type float, got 'fast'."),
         ({"optim__lr": True}, "optim.lr must be of type float, got True."),
@@ -373,8 +373,18 @@ REFUSED = [
     ),
     *(
         ({name: 0}, f"{name} must be at least 1, got 0.")
-        for name in ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "log_every", "threads")
+        for name in (
+            "num_envs",
+            "eval_every",
+            "eval_episodes",
+            "checkpoint_every",
+            "log_every",
+            "threads",
+            "checkpoint_keep",
+        )
     ),
+    ({"resume": "yes"}, "resume must be one of off, on, auto, got 'yes'."),
+    ({"checkpoint_minutes": 0.0}, "checkpoint_minutes must be positive or null, got 0.0."),
     ({"device": "tpu"}, "device must be one of auto, cpu, cuda, got 'tpu'."),
     ({"compile": "most"}, "compile must be one of auto, off, default, max, got 'most'."),
     ({"logger": "mlflow"}, "logger must be one of none, tensorboard, wandb, got 'mlflow'."),
@@ -409,8 +419,9 @@ def test_the_last_possible_value_is_accepted(settings):
         assert (config[group[0]] if group else config)[last] == value
 
 
-def test_resume_says_what_to_do_instead():
-    assert refusal(resume=True).startswith("resume is not implemented yet; start a new run_dir")
+@pytest.mark.parametrize(("given", "meant"), [(True, "on"), (False, "off"), ("auto", "auto"), ("on", "on")])
+def test_resume_is_what_yaml_makes_of_true_false_and_auto(given, meant):
+    assert TrainConfig.from_dict(overrides(resume=given)).resume == meant
 
 
 def test_an_unknown_task_is_refused_with_the_nearest_names():

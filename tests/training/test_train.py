@@ -94,7 +94,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 def test_a_run_directory_holds_what_it_should_and_nothing_else(finished):
     files = {str(path.relative_to(finished.path)) for path in finished.path.rglob("*") if path.is_file()}
     expected = {"config.yaml", "train.csv", "eval.csv", "summary.json", "curve.png"}
-    assert files == expected | {str(Path("checkpoints", "last.pt"))}
+    expected |= {"checkpoints/last.pt", "checkpoints/best.pt"}
+    expected |= {
+        f"checkpoints/resume/{steps:012d}/{name}"
+        for steps in (80, 160)
+        for name in ("agent.pt", "run.pt", "manifest.json")
+    }
+    assert {file for file in files if not file.startswith("checkpoints/replay/")} == expected
+    assert any(file.startswith("checkpoints/replay/rows-") for file in files)
 
 
 def test_the_configuration_can_be_read_back(finished):

@@ -63,7 +63,7 @@ class ReplayJournal:
         self.rewrite_at = rewrite_at
         self._target_keys = [unravel_key((plan_key, name)) for name in TARGETS]
         self._version_key = unravel_key((plan_key, "version"))
-        self._state: dict[str, Any] = {"written": 0, "version": 0, "rows": [], "targets": []}
+        self.state: dict[str, Any] = {"written": 0, "version": 0, "rows": [], "targets": []}
 
     def save(self, buffer: TensorDictReplayBuffer, *, version: int = 0) -> dict[str, Any]:
         """Writes what is new.
@@ -82,7 +82,7 @@ class ReplayJournal:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         capacity, written = buffer.storage.max_size, buffer.writer._write_count
-        old = self._state
+        old = self.state
         new = {"capacity": capacity, "written": written, "version": version}
         new["rows"] = [entry for entry in old["rows"] if entry["end"] > written - capacity]
         new["targets"] = old["targets"]
@@ -97,7 +97,7 @@ class ReplayJournal:
                 new["rows"] = [*new["rows"], entry | {"begin": start, "end": end}]
             if targets:
                 new["targets"] = self._save_targets(stored.select(*targets), old, begin, written, capacity)
-        self._state = new
+        self.state = new
         return new
 
     def _save_targets(
@@ -159,7 +159,7 @@ class ReplayJournal:
                 times = (written - 1 - torch.arange(capacity)).div(capacity, rounding_mode="floor")
                 state["_generation"] = times.clamp(min=-1)
             buffer.writer.load_state_dict(state)
-        self._state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
+        self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
 
     def _read(self, entry: Mapping[str, Any]) -> TensorDict:
         content = read_checked(self.folder / entry["file"], entry["sha256"])

@@ -12,43 +12,52 @@ from torchrl_etdmpc.training.builders import (
     row_bytes,
 )
 from torchrl_etdmpc.training.checkpoint import CheckpointError, load_agent, read_checkpoint, save_checkpoint
-from torchrl_etdmpc.training.command_line import hydra_main, one_line_errors
+from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, one_line_errors
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.curve import plot_curve
 from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.progress import progress_bar
+from torchrl_etdmpc.training.resume import read_run_config, resumed_config
 from torchrl_etdmpc.training.run_log import RunLog, library_versions
+from torchrl_etdmpc.training.signals import EXIT_CODE, RunInterrupted
+from torchrl_etdmpc.training.store import CheckpointStore
 from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
 from torchrl_etdmpc.training.video import write_mp4
 
 __all__ = [
-    "PRESETS",
-    "Agent",
     "BarePolicy",
-    "CheckpointError",
-    "RunLog",
-    "TrainConfig",
-    "TrainingRun",
+    "preset",
     "Updater",
-    "build_agent",
-    "build_collector",
-    "build_planner",
+    "read_run_config",
+    "read_checkpoint",
+    "CheckpointError",
+    "plot_curve",
+    "RunLog",
+    "CheckpointStore",
+    "resumed_config",
     "build_reanalyze",
     "build_replay",
-    "build_world_model",
-    "evaluate",
-    "hydra_main",
-    "library_versions",
+    "EXIT_CODE",
     "load_agent",
-    "one_line_errors",
-    "plot_curve",
-    "preset",
-    "progress_bar",
-    "read_checkpoint",
-    "resolve_device",
+    "PRESETS",
+    "hydra_main",
+    "build_collector",
     "row_bytes",
     "save_checkpoint",
+    "build_planner",
+    "build_agent",
     "write_mp4",
+    "TrainConfig",
+    "one_line_errors",
+    "build_world_model",
+    "TrainingRun",
+    "progress_bar",
+    "explicit_settings",
+    "evaluate",
+    "library_versions",
+    "RunInterrupted",
+    "Agent",
+    "resolve_device",
 ]

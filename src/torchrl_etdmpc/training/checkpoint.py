@@ -79,6 +79,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return content
 
 
+def load_state(agent: Agent, content: dict[str, Any]) -> None:
+    """Gives an agent the weights, targets, running scale and optimisers of :func:`read_checkpoint`."""
+    agent.world_model.load_state_dict(content["world_model"])
+    agent.loss.load_state_dict(content["loss"])
+    agent.updater.load_state_dict(content["optimisers"])
+
+
 def load_agent(
     path: str | Path,
     *,
@@ -116,9 +123,7 @@ def load_agent(
     try:
         config = TrainConfig.from_dict(values)
         agent = build_agent(config, *saved, device=device)
-        agent.world_model.load_state_dict(content["world_model"])
-        agent.loss.load_state_dict(content["loss"])
-        agent.updater.load_state_dict(content["optimisers"])
+        load_state(agent, content)
     except (RuntimeError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:160]
         raise CheckpointError(f"{path} does not fit its own configuration ({reason}).") from error

@@ -83,6 +83,17 @@ def hydra_main(
     return decorate
 
 
+def explicit_settings(arguments: list[str] | None = None) -> list[str]:
+    """Settings that the command line names, e.g. ``planner.horizon``, without the preset and Hydra's own.
+
+    Args:
+        arguments (list of str, optional): Default: those of this process.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    names = [argument.lstrip("+").partition("=")[0] for argument in given if "=" in argument]
+    return [name for name in names if not name.startswith(("hydra", "-", "~"))]
+
+
 def _check_preset(arguments: list[str]) -> None:
     for argument in arguments:
         if argument.startswith("preset="):

@@ -229,7 +229,12 @@ class TrainConfig:
     """Whether evaluations also report the policy without the planner."""
     checkpoint_every: int = 50_000
     log_every: int = 1_000
-    resume: bool = False
+    checkpoint_minutes: float | None = 15.0
+    """A checkpoint is also written when the last one is this old; ``null`` for never."""
+    checkpoint_keep: int = 2
+    """Checkpoints to go on from that are kept."""
+    resume: str = "off"
+    """``on`` (or ``true``) goes on from the run directory's newest checkpoint, ``auto`` does if there is one."""
     threads: int | None = None
     """CPU threads of PyTorch. Default: PyTorch's own choice."""
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -241,10 +246,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         task = get_task(self.task)
+        _require_choice("resume", self.resume, ("off", "on", "auto"))
         _require(
-            not self.resume,
-            "resume is not implemented yet; start a new run_dir (evaluate.py can load its checkpoints).",
+            self.checkpoint_minutes is None or self.checkpoint_minutes > 0,
+            f"checkpoint_minutes must be positive or null, got {self.checkpoint_minutes}.",
         )
+        _require_positive("", self, "checkpoint_keep")
         _require_choice("device", self.device.split(":")[0], ("auto", "cpu", "cuda"))
         _require_choice("compile", self.compile, ("auto", "off", "default", "max"))
         _require_choice("logger", self.logger, ("none", "tensorboard", "wandb"))

@@ -20,7 +20,7 @@ import os
 import platform
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger, get_logger
@@ -68,6 +68,32 @@ class RunLog:
         self.total_env_steps = total_env_steps
         self._logger = logger
         self._train_columns: tuple[str, ...] | None = None
+        self._lock = _lock(self.run_dir)
+
+    @classmethod
+    def reopen(
+        cls,
+        run_dir: str | os.PathLike[str],
+        *,
+        config: Mapping[str, Any],
+        logger: Literal["none", "tensorboard", "wandb"] = "none",
+        total_env_steps: int,
+    ) -> RunLog:
+        """The log of a run that goes on; arguments and errors as for :meth:`create`.
+
+        Rows are appended where the files end, until :meth:`load_state_dict` says where the run goes on from.
+
+        Raises:
+            FileNotFoundError: ``run_dir`` holds no run.
+        """
+        run_dir = Path(run_dir).expanduser()
+        if not (run_dir / "config.yaml").is_file():
+            raise FileNotFoundError(f"run_dir={run_dir} holds no run to go on with; start it with resume=false.")
+        log = cls(run_dir, total_env_steps=total_env_steps)
+        with replacing(run_dir / "config.yaml") as partial:
+            partial.write_text(_to_yaml(config), encoding="utf-8")
+        log._logger = _make_logger(logger, run_dir, config)
+        return log
 
     @classmethod
     def create(
@@ -217,6 +243,34 @@ class RunLog:
         if self._logger is not None:
             self._logger.shutdown()
             self._logger = None
+        if self._lock is not None:
+            Path(self._lock.name).unlink(missing_ok=True)
+            self._lock.close()
+            self._lock = None
+
+    def state_dict(self) -> dict[str, int]:
+        """How long the files are: a run that goes on from here forgets what was written later."""
+        files = {name: self.run_dir / name for name in ("train.csv", "eval.csv")}
+        return {name: file.stat().st_size if file.exists() else 0 for name, file in files.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
+        """Cuts the files off where they ended when :meth:`state_dict` was called.
+
+        Raises:
+            OSError: a file is shorter than it was.
+        """
+        for name, size in state_dict.items():
+            path = self.run_dir / name
+            present = path.stat().st_size if path.exists() else 0
+            if present < size:
+                raise OSError(f"{path} has {present} bytes but the checkpoint saw {size}: rows were removed from it.")
+            if size:
+                os.truncate(path, size)
+            else:
+                path.unlink(missing_ok=True)
+        if state_dict.get("train.csv"):
+            with (self.run_dir / "train.csv").open(newline="", encoding="utf-8") as file:
+                self._train_columns = tuple(next(csv.reader(file)))
 
     def _append(self, split: Literal["train", "eval"], row: dict[str, float], columns: tuple[str, ...]) -> None:
         path = self.run_dir / f"{split}.csv"
@@ -244,6 +298,26 @@ def library_versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return versions
+
+
+def _lock(run_dir: Path) -> IO[str] | None:
+    """Keeps other processes out of the run directory until the file is closed, or the process ends."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    file = (run_dir / ".lock").open("w")
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock, not inherited by environments' processes
+    except (BlockingIOError, PermissionError) as error:
+        file.close()
+        raise OSError(
+            f"run_dir={run_dir} is in use by another process; wait for it or choose another run_dir."
+        ) from error
+    except OSError:  # a file system without locks
+        file.close()
+        return None
+    return file
 
 
 def _require_logger(name: str) -> None:

@@ -9,12 +9,13 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl import torchrl_logger
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.collectors import NonFiniteError
+from torchrl_etdmpc.envs import simulator_state
 from torchrl_etdmpc.training.builders import (
     build_agent,
     build_collector,
@@ -23,11 +24,17 @@ from torchrl_etdmpc.training.builders import (
     resolve_device,
     row_bytes,
 )
-from torchrl_etdmpc.training.checkpoint import save_checkpoint
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
-from torchrl_etdmpc.training.progress import progress_bar
+from torchrl_etdmpc.training.progress import ProgressBar, progress_bar
 from torchrl_etdmpc.training.run_log import RunLog
+from torchrl_etdmpc.training.run_state import capture, restore
+from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
+from torchrl_etdmpc.training.store import CheckpointStore
+
+
+class _EvaluationLeftError(Exception):
+    """A signal came while the environment was evaluated."""
 
 
 class TrainingRun:
@@ -38,9 +45,17 @@ class TrainingRun:
         env (EnvBase): batch size [] or [config.num_envs]; closed at the end.
         eval_env (EnvBase): batch size [config.eval_episodes]; closed at the end.
         log (RunLog): the run directory.
+
+    Keyword Args:
+        resume (bool): go on from the newest checkpoint in the run directory, exactly as if nothing had happened.
+
+    Raises:
+        CheckpointError: if ``resume`` finds no checkpoint that is whole.
     """
 
-    def __init__(self, config: TrainConfig, *, env: EnvBase, eval_env: EnvBase, log: RunLog) -> None:
+    def __init__(
+        self, config: TrainConfig, *, env: EnvBase, eval_env: EnvBase, log: RunLog, resume: bool = False
+    ) -> None:
         self.config = config
         self.log = log
         self.device = resolve_device(config.device)
@@ -53,18 +68,34 @@ class TrainingRun:
         self.reanalyze = build_reanalyze(config, self.agent, self.replay)
         self.collector = build_collector(config, self.agent, env, self.replay)
         self.action_repeat = config.task_spec.action_repeat
+        self.store = CheckpointStore(log.run_dir / "checkpoints", keep=config.checkpoint_keep)
+        self.stage = "seed"  # then "pretrain", then "learn"
+        self.pretrained = 0
+        self.pending = ["evaluate"]  # what the last step called for and is not done yet
         self.eval_returns: list[float] = []
-        self._episode_returns: list[float] = []  # training episodes since the last row of train.csv
-        self._metrics: dict[str, torch.Tensor] = {}
+        self.eval_simulator = simulator_state(self.eval_env)  # as the last evaluation left it
+        self.episode_returns: list[float] = []  # training episodes since the last row of train.csv
+        self.metrics: dict[str, torch.Tensor] = {}
+        self.start = time.perf_counter()
+        self.learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
-        self._start = time.perf_counter()
         self._compile_s = 0.0
-        self._learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
+        self._saved_at = self.start
+        self._stop = StopSignals()
+        if resume:
+            restored = self.store.load(self.agent, self.replay)
+            restore(self, restored.state)
+            torchrl_logger.info(f"going on from {restored.folder} ({self.env_steps} env steps)")
 
     @property
     def env_steps(self) -> int:
         """Environment steps so far, action repeats counted."""
         return self.collector.frames * self.action_repeat
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds of work so far, those before an interruption included."""
+        return time.perf_counter() - self.start
 
     def counters(self) -> dict[str, int | float]:
         """The columns that every file of the run counts by."""
@@ -72,45 +103,23 @@ class TrainingRun:
             "env_steps": self.env_steps,
             "decision_steps": self.collector.frames,
             "updates": self.agent.updater.updates,
-            "wall_time_s": round(time.perf_counter() - self._start, 2),
+            "wall_time_s": round(self.wall_s, 2),
         }
 
     def run(self) -> dict[str, Any]:
         """Trains to the budget and writes the summary, which it returns.
 
         Raises:
+            RunInterrupted: if a signal asked the run to stop; it is saved.
             NonFiniteError: if the environment or the policy breaks; the run is saved first.
         """
-        config = self.config
         try:
             self.warm_up()
-            with progress_bar(config.total_env_steps) as progress:
-                self.evaluate()
-                for _ in range(math.ceil(config.seed_decisions / config.num_envs)):
-                    self.step()
-                self.pretrain()
-                if config.seed_decisions and self._passed(config.eval_every):
-                    self.evaluate()
-                while self.env_steps < config.total_env_steps:
-                    tick = time.perf_counter()
-                    if config.overlap:
-                        self.step(meanwhile=self.updates)
-                    else:
-                        self.step()
-                        self.updates()
-                    self._learning_s += time.perf_counter() - tick
-                    last = self.env_steps >= config.total_env_steps
-                    if last or self._passed(config.log_every):
-                        self.write_metrics()
-                    if last or self._passed(config.eval_every):
-                        self.evaluate()
-                    if last or self._passed(config.checkpoint_every):
-                        self.save()
-                    progress.update(
-                        env_steps=self.env_steps,
-                        decision_steps=self.collector.frames,
-                        last_return=self.eval_returns[-1],
-                    )
+            with self._stop, progress_bar(self.config.total_env_steps, initial=self.env_steps) as progress:
+                self._catch_up()
+                self._seed()
+                self._pretrain()
+                self._learn(progress)
         except NonFiniteError:
             self.save()
             raise
@@ -120,6 +129,66 @@ class TrainingRun:
         summary = self.summary()
         self.log.finish(summary)
         return summary
+
+    def _seed(self) -> None:
+        while self.stage == "seed":
+            if not self.collector.in_seed_phase:
+                self.stage = "pretrain"
+                return
+            self.step()
+            self._after_work()
+
+    def _pretrain(self) -> None:
+        if self.stage != "pretrain":
+            return
+        self.pretrain(self._after_work)
+        self.stage = "learn"
+        if self.config.seed_decisions and self._passed(self.config.eval_every):
+            self.pending.append("evaluate")
+        self._catch_up()
+
+    def _learn(self, progress: ProgressBar) -> None:
+        config = self.config
+        while self.env_steps < config.total_env_steps:
+            tick = time.perf_counter()
+            if config.overlap:
+                self.step(meanwhile=self.updates)
+            else:
+                self.step()
+                self.updates()
+            self.learning_s += time.perf_counter() - tick
+            last = self.env_steps >= config.total_env_steps
+            due = {"write_metrics": config.log_every, "evaluate": config.eval_every, "save": config.checkpoint_every}
+            self.pending += [name for name, interval in due.items() if last or self._passed(interval)]
+            self._after_work()
+            latest = self.eval_returns[-1] if self.eval_returns else None
+            progress.update(env_steps=self.env_steps, decision_steps=self.collector.frames, last_return=latest)
+
+    def _after_work(self) -> None:
+        """Does what is due, and stops here if that was asked for."""
+        minutes = self.config.checkpoint_minutes
+        if minutes is not None and "save" not in self.pending and time.perf_counter() - self._saved_at > 60 * minutes:
+            self.pending.append("save")
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        while self.pending:
+            self._stop_if_asked()
+            name = self.pending[0]
+            if name == "save":
+                self.pending.pop(0)  # a run that goes on from this checkpoint need not save it again
+                self.save()
+            else:
+                getattr(self, name)()
+                self.pending.pop(0)
+        self._stop_if_asked()
+
+    def _stop_if_asked(self) -> None:
+        if self._stop.requested:
+            self.save()
+            raise RunInterrupted(
+                f"stopped at {self.env_steps} env steps and saved in {self.log.run_dir}; go on with resume=true."
+            )
 
     def warm_up(self) -> None:
         """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
@@ -175,35 +244,58 @@ class TrainingRun:
     def step(self, meanwhile: Callable[[], None] | None = None) -> None:
         """One decision of every environment; ``meanwhile`` is called before the environments step."""
         rows = self.collector.step(meanwhile)
-        self._episode_returns.extend(rows["next", "episode_reward"][rows["next", "done"]].tolist())
+        self.episode_returns.extend(rows["next", "episode_reward"][rows["next", "done"]].tolist())
 
     def update(self, *, distill: bool = True) -> None:
         """One gradient step on a fresh sample."""
         batch = self.replay.sample().to(self.device).reshape(-1, self.config.loss.slice_len)
-        self._metrics.update(self.agent.updater.step(batch, distill=distill).items())
+        self.metrics.update(self.agent.updater.step(batch, distill=distill).items())
 
     def updates(self) -> None:
         """The updates that one decision of every environment calls for."""
         for _ in range(self.config.optim.updates_per_decision * self.config.num_envs):
             self.update()
 
-    def pretrain(self) -> None:
+    def pretrain(self, after_update: Callable[[], None] | None = None) -> None:
         """Updates of world model and value on the seed data; the policy has nothing to learn from random actions."""
         if self.reanalyze is not None:
             self.reanalyze.enabled = False
-        for _ in range(self.config.pretrain_updates):
+        while self.pretrained < self.config.pretrain_updates:
             self.update(distill=False)
+            self.pretrained += 1
+            if after_update is not None:
+                after_update()
         if self.reanalyze is not None:
             self.reanalyze.enabled = True
 
     def evaluate(self) -> None:
         """Appends a row to ``eval.csv``. Training draws the same random numbers whether it is evaluated or not."""
-        options = {"episodes": self.config.eval_episodes, "policy_device": self.device}
-        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
-            returns = evaluate(self.eval_env, self.agent.eval_planner, **options)
-            if self.config.eval_policy:
-                bare = evaluate(self.eval_env, BarePolicy(self.agent.world_model), **options)
-                self._metrics["policy_return"] = bare.mean()
+        options = {
+            "episodes": self.config.eval_episodes,
+            "policy_device": self.device,
+            "on_step": self._leave_evaluation,
+        }
+        try:
+            with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+                returns = evaluate(self.eval_env, self.agent.eval_planner, **options)
+                bare = (
+                    evaluate(self.eval_env, BarePolicy(self.agent.world_model), **options)
+                    if self.config.eval_policy
+                    else None
+                )
+        except _EvaluationLeftError:
+            self._stop_if_asked()  # with training's random numbers; the evaluation is repeated from its beginning
+        except Exception as error:
+            if not self.collector.frames:
+                raise  # nothing is lost yet
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            warnings.warn(
+                f"the evaluation at {self.env_steps} env steps failed ({reason}); training goes on.", stacklevel=2
+            )
+            return
+        if bare is not None:
+            self.metrics["policy_return"] = bare.mean()
+        self.eval_simulator = simulator_state(self.eval_env)
         self.eval_returns.append(returns.mean().item())
         self.log.log_eval(
             **self.counters(),
@@ -212,12 +304,16 @@ class TrainingRun:
             episodes=len(returns),
         )
 
+    def _leave_evaluation(self, _: TensorDictBase) -> None:
+        if self._stop.requested:
+            raise _EvaluationLeftError
+
     def write_metrics(self) -> None:
         """Appends a row to ``train.csv``."""
-        row = {name: float(value) for name, value in self._metrics.items()}
-        finished = self._episode_returns
+        row = {name: float(value) for name, value in self.metrics.items()}
+        finished = self.episode_returns
         row["episode_return"] = sum(finished) / len(finished) if finished else math.nan
-        self._episode_returns = []
+        self.episode_returns = []
         if self.reanalyze is not None:
             row["targets_refreshed"] = self.reanalyze.refreshed
             row["targets_stale"] = self.reanalyze.stale
@@ -226,8 +322,14 @@ class TrainingRun:
         self.log.log_train(row, **self.counters())
 
     def save(self) -> None:
-        """Writes ``checkpoints/last.pt``."""
-        save_checkpoint(self.log.run_dir / "checkpoints" / "last.pt", self.agent, self.config, self.counters())
+        """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time."""
+        self._saved_at = time.perf_counter()
+        best = bool(self.eval_returns) and self.eval_returns[-1] >= max(self.eval_returns)
+        try:
+            self.store.save(self.agent, self.config, self.counters(), self.replay, capture(self), best=best)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            warnings.warn(f"no checkpoint at {self.env_steps} env steps ({reason}); training goes on.", stacklevel=2)
 
     def summary(self) -> dict[str, Any]:
         """What the run came to."""
@@ -237,11 +339,11 @@ class TrainingRun:
             "preset": self.config.preset,
             "seed": self.config.seed,
             "env_steps": self.env_steps,
-            "final_return": self.eval_returns[-1],
-            "best_return": max(self.eval_returns),
+            "final_return": self.eval_returns[-1] if self.eval_returns else math.nan,
+            "best_return": max(self.eval_returns, default=math.nan),
             "wall_time_s": self.counters()["wall_time_s"],
             "compile_s": round(self._compile_s, 2),
-            "decisions_per_second": learned / self._learning_s if self._learning_s else math.nan,
+            "decisions_per_second": learned / self.learning_s if self.learning_s else math.nan,
             "parameters": sum(parameter.numel() for parameter in self.agent.world_model.parameters()),
             "device": torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
             "threads": self._threads,

@@ -1,0 +1,56 @@
+"""Signals that ask a run to stop: finish the step, save, leave."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from types import FrameType, TracebackType
+
+from torchrl import torchrl_logger
+
+EXIT_CODE = 75
+"""Of a run that was asked to stop and can go on (EX_TEMPFAIL of sysexits.h)."""
+_NAMES = ("SIGTERM", "SIGINT", "SIGUSR1")  # what SLURM and Kubernetes send, and the keyboard
+
+
+class RunInterrupted(Exception):
+    """The run was asked to stop, and has been saved."""
+
+
+class StopSignals:
+    """Notes the first signal; a second one ends the process at once.
+
+    Only the main thread can handle signals; in another one this does nothing.
+
+    >>> with StopSignals() as stop:
+    ...     stop.requested
+    False
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            for name in _NAMES:
+                if hasattr(signal, name):
+                    number = getattr(signal, name)
+                    self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        name = signal.Signals(number).name
+        if self.requested:
+            os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
+            os._exit(128 + number)
+        self.requested = True
+        torchrl_logger.info(f"{name}: finishing this step, saving and stopping; send it again to stop at once")

@@ -1,0 +1,167 @@
+"""Training processes that are killed, asked to stop and started again."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+pytest.importorskip("hydra")
+
+from torchrl_etdmpc.training import EXIT_CODE  # noqa: E402
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = ROOT / "examples" / "train_dmc.py"
+COMMAND = (
+    "task=cartpole-balance preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=700 log_every=40 "
+    "eval_every=300 eval_episodes=1 checkpoint_every=30 model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 "
+    "planner.horizon=2 planner.num_samples=8 planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 "
+    "reanalyze.num_samples=6 reanalyze.num_elites=3 reanalyze.iterations=1 optim.batch_size=4 "
+    "replay.seed_decisions=40 replay.pretrain_updates=4"
+).split()
+
+
+def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
+    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPT), *COMMAND, *arguments],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen[str], code: int = 0) -> str:
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == code, err
+    return out + err
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    limit = time.monotonic() + 120
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+
+
+def checkpoints(run_dir: Path) -> list[str]:
+    return sorted(path.name for path in (run_dir / "checkpoints" / "resume").glob("[0-9]*"))
+
+
+def results(run_dir: Path) -> dict[str, object]:
+    """Curves without their wall times, and weights."""
+
+    def rows(name: str) -> list[dict[str, str]]:
+        with (run_dir / name).open(newline="") as file:
+            return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in csv.DictReader(file)]
+
+    content = torch.load(run_dir / "checkpoints" / "last.pt", weights_only=True)
+    weights = {name: value.tolist() for name, value in content["loss"].items()}
+    return {"train": rows("train.csv"), "eval": rows("eval.csv"), "weights": weights}
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory) -> dict[str, object]:
+    directory = tmp_path_factory.mktemp("straight")
+    finish(start(directory, "run_dir=run"))
+    return results(directory / "run")
+
+
+def kill_and_go_on(directory: Path, kills: int, seed: int, *arguments: str) -> None:
+    """Kills the process at random moments, mostly between checkpoints and sometimes while one is written."""
+    moments = random.Random(seed)
+    run_dir = directory / "run"
+    for _ in range(kills):
+        process = start(directory, "run_dir=run", "resume=auto", *arguments)
+        before = checkpoints(run_dir)
+        with contextlib.suppress(AssertionError):  # it may finish before it is killed
+            wait_for(lambda known=before: checkpoints(run_dir) != known, process)
+        time.sleep(moments.uniform(0, 0.3))
+        process.kill()
+        process.communicate()
+    finish(start(directory, "run_dir=run", "resume=auto", *arguments))
+
+
+def test_a_run_that_is_killed_three_times_ends_as_if_it_had_not_been(tmp_path, straight):
+    kill_and_go_on(tmp_path, kills=3, seed=0)
+    assert results(tmp_path / "run") == straight
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", [("compile=off",), ("compile=default",), ("num_envs=3",)], ids=" ".join)
+def test_a_run_that_is_killed_twenty_times_ends_as_if_it_had_not_been(tmp_path, arguments):
+    (tmp_path / "straight").mkdir()
+    (tmp_path / "killed").mkdir()
+    finish(start(tmp_path / "straight", "run_dir=run", *arguments))
+    kill_and_go_on(tmp_path / "killed", 20, 1, *arguments)
+    assert results(tmp_path / "killed" / "run") == results(tmp_path / "straight" / "run")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1], ids=lambda number: number.name)
+def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, straight, number):
+    process = start(tmp_path, "run_dir=run")
+    wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
+    process.send_signal(number)
+    tick = time.monotonic()
+    text = finish(process, EXIT_CODE)
+    assert time.monotonic() - tick < 30
+    assert "env steps and saved in run; go on with resume=true." in text
+    assert "Traceback" not in text
+    finish(start(tmp_path, "run_dir=run", "resume=true"))
+    assert results(tmp_path / "run") == straight
+
+
+def test_a_second_signal_ends_the_process_at_once_and_the_last_checkpoint_stays(tmp_path, straight):
+    process = start(tmp_path, "run_dir=run")
+    wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
+    process.send_signal(signal.SIGSTOP)  # so that both arrive before the step is finished
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGCONT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode in {128 + signal.SIGTERM, 128 + signal.SIGINT}, err
+    assert "again: stopping at once; the last checkpoint stays." in err
+    finish(start(tmp_path, "run_dir=run", "resume=true"))
+    assert results(tmp_path / "run") == straight
+
+
+def test_a_second_run_in_the_same_directory_is_refused_while_the_first_one_goes_on(tmp_path, straight):
+    first = start(tmp_path, "run_dir=run")
+    wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, first)
+    text = finish(start(tmp_path, "run_dir=run", "resume=true"), 1)
+    assert "error: run_dir=run is in use by another process; wait for it or choose another run_dir." in text
+    finish(first)
+    assert results(tmp_path / "run") == straight
+
+
+def test_going_on_with_a_finished_run_does_nothing(tmp_path):
+    finish(start(tmp_path, "run_dir=run"))
+    before = results(tmp_path / "run")
+    assert "run is finished; nothing to do" in finish(start(tmp_path, "run_dir=run", "resume=auto"))
+    assert results(tmp_path / "run") == before
+
+
+def test_another_setting_than_the_run_s_is_refused(tmp_path):
+    process = start(tmp_path, "run_dir=run")
+    wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
+    process.terminate()
+    finish(process, EXIT_CODE)
+    text = finish(start(tmp_path, "run_dir=run", "resume=true", "optim.batch_size=8"), 1)
+    assert "error: optim.batch_size=8 was asked for, but this run was started with optim.batch_size=4;" in text

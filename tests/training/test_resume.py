@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import csv
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+
+from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.training import (  # noqa: E402
+    CheckpointError,
+    RunInterrupted,
+    RunLog,
+    TrainConfig,
+    TrainingRun,
+    read_run_config,
+    resumed_config,
+)
+
+
+def tiny_config(**changes: Any) -> TrainConfig:
+    values: dict[str, Any] = {
+        "task": "cartpole-swingup",
+        "preset": "cpu",
+        "total_env_steps": 140,
+        "compile": "off",
+        "eval_every": 60,
+        "eval_episodes": 2,
+        "checkpoint_every": 50,
+        "log_every": 20,
+        "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+        "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+        "reanalyze": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 1},
+        "optim": {"batch_size": 4, "updates_per_decision": 2},
+        "replay": {"seed_decisions": 24, "pretrain_updates": 7},
+    }
+    values["reanalyze"] |= {"every": 3, "num_slices": 2}
+    for name, change in changes.items():
+        values[name] = {**values.get(name, {}), **change} if isinstance(change, dict) else change
+    return TrainConfig.from_dict(values)
+
+
+def make_run(config: TrainConfig, run_dir: Path, *, resume: bool = False) -> TrainingRun:
+    """As a new process would: the random numbers are somewhere else until they are restored."""
+    seed = 99 if resume else 0
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+    random.seed(seed)
+    env = make_dmc_env(config.task, seed=7 + seed, num_envs=config.num_envs, parallel=False)
+    eval_env = make_dmc_env(config.task, seed=8 + seed, num_envs=config.eval_episodes, parallel=False)
+    for base in (env, eval_env):
+        for single in getattr(base, "_envs", [base]):
+            single.base_env._env._step_limit = 40  # control steps; the suite's 1000 would cost more than they show
+    log = (RunLog.reopen if resume else RunLog.create)(
+        run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps
+    )
+    return TrainingRun(config, env=env, eval_env=eval_env, log=log, resume=resume)
+
+
+def results(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
+    """Everything that must not depend on interruptions, as comparable values."""
+
+    def rows(name: str) -> list[dict[str, str]]:
+        with (run_dir / name).open(newline="") as file:
+            return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in csv.DictReader(file)]
+
+    stored = run.replay.storage[:]
+    summary = json.loads((run_dir / "summary.json").read_text())
+    return {
+        "train.csv": rows("train.csv"),
+        "eval.csv": rows("eval.csv"),
+        "summary": {key: summary[key] for key in ("env_steps", "final_return", "best_return")},
+        "weights": {name: value.tolist() for name, value in run.agent.loss.state_dict().items()},
+        "optimisers": str(run.agent.updater.state_dict()),
+        "replay": {str(key): stored.get(key).tolist() for key in stored.keys(True, True)},
+        "generations": run.replay.writer.generations_of(torch.arange(len(run.replay))).tolist(),
+        "random": torch.rand(3).tolist(),
+    }
+
+
+def stop_at(run: TrainingRun, owner: Any, method: str, call: int) -> None:
+    """As if the signal came during the given call of a method."""
+    original, calls = getattr(owner, method), [0]
+
+    def watched(*args: Any, **kwargs: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == call:
+            run._stop.requested = True
+        return original(*args, **kwargs)
+
+    setattr(owner, method, watched)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory) -> Callable[[TrainConfig], dict[str, Any]]:
+    """The results of a run without interruptions, one per configuration."""
+    known: dict[str, dict[str, Any]] = {}
+
+    def run(config: TrainConfig) -> dict[str, Any]:
+        key = str(config)
+        if key not in known:
+            run_dir = tmp_path_factory.mktemp("straight")
+            run = make_run(config, run_dir)
+            run.run()
+            known[key] = results(run, run_dir)
+        return known[key]
+
+    return run
+
+
+PLACES = {
+    "in the first evaluation": (lambda run: (run.eval_env, "step_and_maybe_reset"), 5),
+    "in the seed phase": (lambda run: (run.collector, "step"), 13),
+    "in pretraining": (lambda run: (run.agent.updater, "step"), 4),
+    "in an update": (lambda run: (run.agent.updater, "step"), 20),
+    "in a decision in mid-episode": (lambda run: (run.collector, "step"), 33),
+    "at the end of an episode": (lambda run: (run.collector, "step"), 40),
+    "in a later evaluation": (lambda run: (run.eval_env, "step_and_maybe_reset"), 30),
+    "while it is saved": (lambda run: (run.store, "save"), 1),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, straight, place):
+    config = tiny_config()
+    run = make_run(config, tmp_path)
+    find, call = PLACES[place]
+    stop_at(run, *find(run), call)
+    with pytest.raises(RunInterrupted, match=r"^stopped at \d+ env steps and saved in .*; go on with resume=true\.$"):
+        run.run()
+    run.log.close()
+    resumed = make_run(config, tmp_path, resume=True)
+    resumed.run()
+    assert results(resumed, tmp_path) == straight(config)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"num_envs": 3, "total_env_steps": 200},
+        {"replay": {"insertion": "episode", "seed_decisions": 500}, "total_env_steps": 1040, "eval_every": 1020},
+        {"replay": {"capacity": 30}},
+        {"reanalyze": {"every": 0}},
+        {"overlap": True},
+        {"planner": {"first_action": "mean"}, "eval_policy": True},
+    ],
+)
+def test_every_kind_of_run_can_be_stopped_many_times(tmp_path, straight, changes):
+    config = tiny_config(**changes)
+    run = make_run(config, tmp_path)
+    for call in (9, 4, 3, 7, 1):
+        stop_at(run, run.collector, "step", call)
+        with pytest.raises(RunInterrupted):
+            run.run()
+        run.log.close()
+        run = make_run(config, tmp_path, resume=True)
+    run.run()
+    assert results(run, tmp_path) == straight(config)
+
+
+def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(tmp_path, straight):
+    config = tiny_config()
+
+    class Killed(BaseException):
+        pass
+
+    def die() -> None:
+        raise Killed
+
+    run = make_run(config, tmp_path)
+    original = run.collector.step
+    calls = iter([original] * 62 + [lambda *_: die()])
+    run.collector.step = lambda *args: next(calls)(*args)
+    with pytest.raises(Killed):
+        run.run()
+    assert len((tmp_path / "eval.csv").read_text().splitlines()) == 4  # a row that the checkpoint has not seen
+    run.log.close()
+    with (tmp_path / "train.csv").open("a") as file:
+        file.write("12,3,half a ro")
+    resumed = make_run(config, tmp_path, resume=True)
+    assert resumed.env_steps == 100
+    resumed.run()
+    assert results(resumed, tmp_path) == straight(config)
+
+
+def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path):
+    short = tiny_config(total_env_steps=100)
+    run = make_run(short, tmp_path)
+    run.run()
+    longer = resumed_config(read_run_config(tmp_path), tiny_config(total_env_steps=140), ["total_env_steps"])
+    resumed = make_run(longer, tmp_path, resume=True)
+    assert resumed.run()["env_steps"] == 140
+    assert read_run_config(tmp_path).total_env_steps == 140
+    assert len(resumed.replay) == 70
+
+
+def test_other_settings_must_stay(tmp_path):
+    saved = tiny_config()
+    asked = tiny_config(planner={"horizon": 3}, threads=2)
+    assert resumed_config(saved, asked, ["threads"]).threads == 2
+    assert resumed_config(saved, asked, []).planner.horizon == 2
+    with pytest.raises(ValueError, match=r"^planner.horizon=3 was asked for, but this run was started with "):
+        resumed_config(saved, asked, ["planner.horizon"])
+
+
+@pytest.mark.parametrize("damaged", ["agent.pt", "run.pt", "manifest.json", "replay"])
+@pytest.mark.parametrize("how", ["missing", "cut off", "a flipped bit"])
+def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(tmp_path, straight, damaged, how):
+    config = tiny_config()
+    make_run(config, tmp_path).run()
+    checkpoints = tmp_path / "checkpoints"
+    newest = checkpoints / "resume" / f"{140:012d}"
+    if damaged == "replay":
+        before = json.loads((checkpoints / "resume" / f"{100:012d}" / "manifest.json").read_text())["replay"]
+        after = json.loads((newest / "manifest.json").read_text())["replay"]
+        names = [entry["file"] for entry in after["rows"] if entry not in before["rows"]]
+        file = checkpoints / "replay" / names[0]
+    else:
+        file = newest / damaged
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 255
+    {
+        "missing": file.unlink,
+        "cut off": lambda: file.write_bytes(data[: len(data) // 2]),
+        "a flipped bit": lambda: file.write_bytes(data),
+    }[how]()
+    (tmp_path / "summary.json").unlink()
+    with pytest.warns(UserWarning, match=r"^going on from .*/000000000100, because "):
+        resumed = make_run(config, tmp_path, resume=True)
+    assert resumed.env_steps == 100
+    resumed.run()
+    assert results(resumed, tmp_path) == straight(config)
+
+
+def test_without_any_checkpoint_the_error_says_so(tmp_path):
+    config = tiny_config()
+    RunLog.create(tmp_path, config=config.to_dict(), total_env_steps=140).close()
+    with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\.$"):
+        make_run(config, tmp_path, resume=True)
