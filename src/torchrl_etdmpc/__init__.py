@@ -6,7 +6,7 @@ heads, ``A`` action, ``L`` latent, ``O`` observation, ``M`` bins. ``[..., N, H, 
 candidates, steps, action dimensions".
 """
 
-from torchrl_etdmpc.collectors import NonFiniteError, SeedPolicy, StepCollector
+from torchrl_etdmpc.collectors import NonFiniteError, SeedPolicy, SimulatorError, StepCollector
 from torchrl_etdmpc.envs import LatentEnv
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives import (
@@ -35,6 +35,7 @@ __all__ = [
     "PlanTrace",
     "ReanalyzeTransform",
     "SeedPolicy",
+    "SimulatorError",
     "StepCollector",
     "StepSliceSampler",
     "WorldModel",

@@ -381,6 +381,8 @@ REFUSED = [
             "log_every",
             "threads",
             "checkpoint_keep",
+            "max_faults",
+            "max_skipped",
         )
     ),
     ({"resume": "yes"}, "resume must be one of off, on, auto, got 'yes'."),

@@ -41,7 +41,7 @@ def png_size(path: Path) -> tuple[int, int]:
 
 def test_create_writes_the_resolved_config_and_nothing_else(tmp_path):
     create(tmp_path / "runs" / "walker")
-    assert [path.name for path in (tmp_path / "runs" / "walker").iterdir()] == ["config.yaml"]
+    assert [path.name for path in (tmp_path / "runs" / "walker").iterdir()] == [".lock", "config.yaml"]
     assert yaml.safe_load((tmp_path / "runs" / "walker" / "config.yaml").read_text()) == CONFIG
 
 

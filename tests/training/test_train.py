@@ -322,10 +322,15 @@ class BreakingReward(Transform):
 
 
 @pytest.mark.parametrize(("steps", "updates"), [(10, 0), (33, 7 + 2 * 3)], ids=["while seeding", "while learning"])
-def test_a_broken_environment_stops_the_run_after_its_agent_was_saved(tmp_path, steps, updates):
-    run = make_run(tiny_config(), tmp_path, BreakingReward(steps))
-    with pytest.raises(NonFiniteError, match=rf"reward.* at decision step {steps} ") as caught:
+def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(tmp_path, steps, updates):
+    run = make_run(tiny_config(max_faults=3), tmp_path, BreakingReward(steps))
+    message = rf"reward.* at decision step {steps} .*; training goes on with a fresh episode \(failure \d\)\.$"
+    with (
+        pytest.warns(UserWarning, match=message) as warned,
+        pytest.raises(NonFiniteError, match=rf"reward.* at decision step {steps} ") as caught,
+    ):
         run.run()
+    assert len(warned) == 2
     assert "\n" not in str(caught.value)
     agent, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
     assert (counters["decision_steps"], counters["updates"]) == (steps, updates)
@@ -336,10 +341,89 @@ def test_a_broken_environment_stops_the_run_after_its_agent_was_saved(tmp_path, 
     assert run.eval_env.is_closed
 
 
+class Crash(Transform):
+    """Raises at some of the environment's steps, as MuJoCo does when its physics diverges."""
+
+    def __init__(self, *steps: int) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        self.steps, self.calls = steps, 0
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.calls += 1
+        if self.calls in self.steps:
+            raise RuntimeError("the physics is invalid: warning 'BADQACC'\nand more")
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return tensordict_reset
+
+
+def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path):
+    run = make_run(tiny_config(max_faults=2, total_env_steps=240), tmp_path, Crash(5, 50, 95))
+    with pytest.warns(UserWarning, match=r"^the environment failed at decision step \d+: the physics is inv") as warned:
+        summary = run.run()
+    assert len(warned) == 3
+    assert summary["env_steps"] == 240
+    assert len(run.replay) == 120
+    assert run.agent.updater.updates == 7 + 2 * 90
+    rows = run.replay[:]
+    ends = rows["collector", "traj_ids"].diff() != 0
+    assert rows["next", "done"].squeeze(-1)[:-1][ends].all()
+    assert rows["next", "truncated"].sum() == rows["next", "done"].sum()
+    assert read_table(tmp_path / "train.csv")[-1]["simulator_faults"] == 3
+
+
+def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path):
+    run = make_run(tiny_config(), tmp_path)
+    step = run.eval_env.step_and_maybe_reset
+    calls = []
+
+    def break_once(tensordict: TensorDictBase):
+        calls.append(1)
+        if len(calls) == EPISODE + 5:
+            raise RuntimeError("no more of it")
+        return step(tensordict)
+
+    run.eval_env.step_and_maybe_reset = break_once
+    message = r"^the evaluation at 80 env steps failed \(no more of it\); training goes on\.$"
+    with pytest.warns(UserWarning, match=message):
+        run.run()
+    assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 160]
+
+
+def test_an_evaluation_that_fails_before_anything_was_learned_is_an_error(tmp_path):
+    run = make_run(tiny_config(), tmp_path)
+
+    def fail(tensordict: TensorDictBase):
+        raise RuntimeError("wrong sizes")
+
+    run.eval_env.step_and_maybe_reset = fail
+    with pytest.raises(RuntimeError, match="wrong sizes"):
+        run.run()
+
+
+def test_updates_that_stay_without_a_finite_gradient_stop_the_run_and_name_the_term(tmp_path):
+    run = make_run(tiny_config(max_skipped=20, optim={"updates_per_decision": 1}), tmp_path)
+    step, calls = run.agent.updater.step, []
+
+    def poisoned(batch: TensorDictBase, *, distill: bool = True):
+        calls.append(1)
+        if len(calls) > 12:
+            batch["next", "reward"][0] = torch.nan
+        return step(batch, distill=distill)
+
+    run.agent.updater.step = poisoned
+    with pytest.raises(NonFiniteError, match=r"^the last \d+ updates had no finite gradient .* loss_reward, "):
+        run.run()
+    agent, _, _ = load_agent(tmp_path / "checkpoints" / "last.pt")
+    assert all(value.isfinite().all() for value in agent.loss.state_dict().values())
+    assert 20 <= int(run.agent.updater.skipped) < 60
+
+
 def test_any_other_error_closes_the_environments_too(tmp_path, monkeypatch):
     run = make_run(tiny_config(), tmp_path)
 
-    def fail() -> None:
+    def fail(*_: Any) -> None:
         raise RuntimeError("out of memory")
 
     monkeypatch.setattr(run, "pretrain", fail)

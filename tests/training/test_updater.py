@@ -340,3 +340,26 @@ def test_the_caller_s_batch_is_left_as_it_is():
     seeded_step(make_updater(), batch)
     assert (batch == before).all()
     assert set(batch.keys(True, True)) == set(before.keys(True, True))
+
+
+@pytest.mark.parametrize("poison", [("next", "reward"), "observation", ("plan", "loc")])
+@pytest.mark.parametrize("distill", [True, False])
+def test_an_update_without_a_finite_gradient_changes_nothing_but_the_count(poison, distill):
+    updater = Updater(EfficientTDMPCLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=16), discount=0.99))
+    good, bad = (random_slices(3, 2, num_slices=4) for _ in range(2))
+    bad[poison][0] = torch.nan
+    if not distill and poison == ("plan", "loc"):
+        pytest.skip("the target is not read")
+    updater.step(good, distill=distill)
+    weights = [parameter.clone() for parameter in updater.loss.world_model.parameters()]
+    optimisers = copy.deepcopy([updater.model_optimizer.state_dict(), updater.policy_optimizer.state_dict()])
+    for number in (1, 2):
+        updater.step(bad, distill=distill)
+        assert (int(updater.skipped), int(updater.skipped_in_a_row)) == (number, number)
+    assert all(map(torch.equal, weights, updater.loss.world_model.parameters()))
+    assert str(optimisers) == str([updater.model_optimizer.state_dict(), updater.policy_optimizer.state_dict()])
+    assert updater.loss.kl_scale.isfinite()
+    metrics = updater.step(good, distill=distill)
+    assert metrics["loss_reward"].isfinite()
+    assert (int(updater.skipped), int(updater.skipped_in_a_row)) == (2, 0)
+    assert not any(map(torch.equal, weights[:1], updater.loss.world_model.parameters()))

@@ -26,6 +26,10 @@ class NonFiniteError(RuntimeError):
     """The environment or the policy returned a value that is not finite."""
 
 
+class SimulatorError(RuntimeError):
+    """The environment raised an exception."""
+
+
 class StepCollector(BaseCollector):
     """Acts, steps and stores, one step of every environment per iteration (thesis 3.4.4, data freshness).
 
@@ -56,8 +60,10 @@ class StepCollector(BaseCollector):
 
     Raises:
         ValueError: if an argument is out of range.
-        NonFiniteError: while iterating, if an observation, a reward or an action is not finite; the step is not
-            stored, and collection can go on with fresh episodes.
+        NonFiniteError: while iterating, if an observation, a reward or an action is not finite. The step is not
+            stored, the running episodes end at their last step, as truncated ones, and collection can go on with
+            fresh ones.
+        SimulatorError: while iterating, if the environment raises; the same holds.
 
     >>> from torchrl.data import LazyTensorStorage
     >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
@@ -114,6 +120,7 @@ class StepCollector(BaseCollector):
         self._frames = 0
         self._next_trajectory = 0
         self._carrier: TensorDictBase | None = None
+        self._last_rows: int | torch.Tensor | None = None
         self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
         self._schema: dict[bool, set] = {}
         excluded = set(self.exclude_keys)
@@ -148,7 +155,7 @@ class StepCollector(BaseCollector):
                 runs while the simulator does; it sees the buffer without this step.
         """
         if self._carrier is None:
-            self._carrier = self._start(self.env.reset())
+            self._carrier = self._start(self._ask(self.env.reset))
         self._check_finite(self._carrier, self._checked_before, "the environment")  # a reset's are new here
         seeding = self.in_seed_phase
         with set_exploration_type(self.exploration_type):
@@ -157,7 +164,7 @@ class StepCollector(BaseCollector):
         if meanwhile is not None:
             with torch.enable_grad():
                 meanwhile()
-        stepped, carrier = self.env.step_and_maybe_reset(tensordict)
+        stepped, carrier = self._ask(self.env.step_and_maybe_reset, tensordict)
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
         rows = kept.reshape(-1)
@@ -167,6 +174,15 @@ class StepCollector(BaseCollector):
         done = stepped.get(("next", "done")).reshape(self.num_envs)
         self._carrier = self._next_carrier(carrier, stepped, done)
         return rows
+
+    def _ask(self, method: Callable[..., Any], *args: Any) -> Any:
+        """Calls the environment; its exceptions end the episode and not the program."""
+        try:
+            return method(*args)
+        except Exception as error:
+            self._truncate_episodes()
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise SimulatorError(f"the environment failed at decision step {self._frames}: {reason}") from error
 
     def _act(self, tensordict: TensorDictBase, seeding: bool) -> TensorDictBase:
         policy = self.seed_policy if seeding else self.policy
@@ -191,9 +207,10 @@ class StepCollector(BaseCollector):
     def _store(self, kept: TensorDictBase, rows: TensorDictBase) -> None:
         if self.insertion == "step":
             if kept.ndim:
-                self.replay_buffer.extend(rows.clone(False))
+                index = self.replay_buffer.extend(rows.clone(False))
             else:  # half the time of extending by one row
-                self.replay_buffer.add(kept.clone(False))
+                index = self.replay_buffer.add(kept.clone(False))
+            self._last_rows = index
             return
         for position, row in enumerate(rows.unbind(0)):
             self._pending[position].append(row.clone())
@@ -203,17 +220,31 @@ class StepCollector(BaseCollector):
 
     def _abandon_episodes(self) -> None:
         self._carrier = None
+        self._last_rows = None
         self._pending = [[] for _ in range(self.num_envs)]
+
+    def _truncate_episodes(self) -> None:
+        """Ends the running episodes at their last stored step, which becomes a truncated one."""
+        for rows in self._pending:
+            if rows:
+                episode = torch.stack(rows)
+                _truncate(episode[-1:])
+                self.replay_buffer.extend(episode)
+        if self._last_rows is not None:
+            last = self.replay_buffer.storage.get(self._last_rows).clone()
+            _truncate(last)
+            self.replay_buffer.storage.set(self._last_rows, last, set_cursor=False)
+        self._abandon_episodes()
 
     def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:
         for key in keys:
             value = tensordict.get(key)
             if value.is_floating_point() and not value.isfinite().all():
                 rows = value.isfinite().reshape(self.num_envs, -1).all(-1).logical_not().nonzero().flatten().tolist()
-                self._abandon_episodes()  # the environment may have moved on
+                self._truncate_episodes()  # the environment may have moved on
                 raise NonFiniteError(
                     f"{source} returned a non-finite {key!r} at decision step {self._frames} (environments {rows}); "
-                    "the step was not stored."
+                    "the step was not stored"
                 )
 
     def _check_schema(self, rows: TensorDictBase, seeding: bool) -> None:
@@ -282,6 +313,15 @@ class StepCollector(BaseCollector):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(num_envs={self.num_envs}, frames={self._frames}, insertion={self.insertion!r})"
+
+
+def _truncate(rows: TensorDictBase) -> None:
+    """Flags the rows that do not end an episode already as truncations, in place."""
+    running = ~rows.get(("next", "done"))
+    for name in ("truncated", "done"):
+        flag = rows.get(("next", name), None)
+        if flag is not None:
+            flag |= running
 
 
 def _with_primer(env: EnvBase, policy: nn.Module) -> EnvBase:

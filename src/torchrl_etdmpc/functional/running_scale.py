@@ -17,7 +17,7 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float) -> Tensor:
         tau (float): rate of the exponential moving average, in [0, 1].
 
     Returns:
-        Tensor: the new scale, a scalar without gradient.
+        Tensor: the new scale, a scalar without gradient. A batch whose spread is not finite leaves it where it is.
 
     >>> updated_scale(torch.tensor(1.0), torch.linspace(0, 100, 101), tau=1.0).item()
     90.0
@@ -25,4 +25,5 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float) -> Tensor:
     quantiles = torch.quantile(
         batch.detach().flatten(), torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device)
     )
-    return torch.lerp(scale, (quantiles[1] - quantiles[0]).to(scale.dtype), tau).clamp_min(1.0)
+    spread = (quantiles[1] - quantiles[0]).to(scale.dtype)
+    return torch.lerp(scale, torch.where(spread.isfinite(), spread, scale), tau).clamp_min(1.0)

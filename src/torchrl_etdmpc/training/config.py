@@ -231,6 +231,10 @@ class TrainConfig:
     log_every: int = 1_000
     checkpoint_minutes: float | None = 15.0
     """A checkpoint is also written when the last one is this old; ``null`` for never."""
+    max_faults: int = 10
+    """Failures of the simulator or of the policy, without a finished episode in between, before the run stops."""
+    max_skipped: int = 100
+    """Updates in a row without a finite gradient, which are skipped, before the run stops."""
     checkpoint_keep: int = 2
     """Checkpoints to go on from that are kept."""
     resume: str = "off"
@@ -251,7 +255,7 @@ class TrainConfig:
             self.checkpoint_minutes is None or self.checkpoint_minutes > 0,
             f"checkpoint_minutes must be positive or null, got {self.checkpoint_minutes}.",
         )
-        _require_positive("", self, "checkpoint_keep")
+        _require_positive("", self, "checkpoint_keep", "max_faults", "max_skipped")
         _require_choice("device", self.device.split(":")[0], ("auto", "cpu", "cuda"))
         _require_choice("compile", self.compile, ("auto", "off", "default", "max"))
         _require_choice("logger", self.logger, ("none", "tensorboard", "wandb"))

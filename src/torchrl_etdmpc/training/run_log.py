@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib.metadata
 import importlib.util
@@ -18,9 +19,11 @@ import json
 import math
 import os
 import platform
+import warnings
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger, get_logger
@@ -33,6 +36,7 @@ __all__ = ["COUNTER_COLUMNS", "EVAL_COLUMNS", "RunLog", "library_versions"]
 COUNTER_COLUMNS = ("env_steps", "decision_steps", "updates", "wall_time_s")
 EVAL_COLUMNS = (*COUNTER_COLUMNS, "return_mean", "return_std", "episodes")
 
+_LOCK = ".lock"
 _LOGGERS = ("none", "tensorboard", "wandb")
 _RUN_ENTRIES = ("config.yaml", "eval.csv", "train.csv", "summary.json", "checkpoints")
 _PACKAGES = ("torchrl-etdmpc", "torch", "torchrl", "tensordict", "dm-control", "mujoco")
@@ -68,7 +72,9 @@ class RunLog:
         self.total_env_steps = total_env_steps
         self._logger = logger
         self._train_columns: tuple[str, ...] | None = None
-        self._lock = _lock(self.run_dir)
+        self._unwritten: dict[str, list[dict[str, float]]] = {"train": [], "eval": []}
+        lock = _lock(self.run_dir)
+        self._unlock = None if lock is None else weakref.finalize(self, os.close, lock)
 
     @classmethod
     def reopen(
@@ -243,23 +249,24 @@ class RunLog:
         if self._logger is not None:
             self._logger.shutdown()
             self._logger = None
-        if self._lock is not None:
-            Path(self._lock.name).unlink(missing_ok=True)
-            self._lock.close()
-            self._lock = None
+        if self._unlock is not None and self._unlock.alive:
+            (self.run_dir / _LOCK).unlink(missing_ok=True)
+            self._unlock()
 
-    def state_dict(self) -> dict[str, int]:
+    def state_dict(self) -> dict[str, Any]:
         """How long the files are: a run that goes on from here forgets what was written later."""
         files = {name: self.run_dir / name for name in ("train.csv", "eval.csv")}
-        return {name: file.stat().st_size if file.exists() else 0 for name, file in files.items()}
+        sizes = {name: file.stat().st_size if file.exists() else 0 for name, file in files.items()}
+        return {"sizes": sizes, "unwritten": {split: list(rows) for split, rows in self._unwritten.items()}}
 
-    def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Cuts the files off where they ended when :meth:`state_dict` was called.
 
         Raises:
             OSError: a file is shorter than it was.
         """
-        for name, size in state_dict.items():
+        self._unwritten = {split: list(rows) for split, rows in state_dict["unwritten"].items()}
+        for name, size in state_dict["sizes"].items():
             path = self.run_dir / name
             present = path.stat().st_size if path.exists() else 0
             if present < size:
@@ -268,18 +275,28 @@ class RunLog:
                 os.truncate(path, size)
             else:
                 path.unlink(missing_ok=True)
-        if state_dict.get("train.csv"):
+        if state_dict["sizes"]["train.csv"]:
             with (self.run_dir / "train.csv").open(newline="", encoding="utf-8") as file:
                 self._train_columns = tuple(next(csv.reader(file)))
 
     def _append(self, split: Literal["train", "eval"], row: dict[str, float], columns: tuple[str, ...]) -> None:
+        self._unwritten[split].append(row)
         path = self.run_dir / f"{split}.csv"
-        is_new = not path.exists()
-        with path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            if is_new:
-                writer.writeheader()
-            writer.writerow(row)
+        size = path.stat().st_size if path.exists() else 0
+        try:
+            with path.open("a", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, columns, lineterminator="\n")
+                if not size:
+                    writer.writeheader()
+                writer.writerows(self._unwritten[split])
+            self._unwritten[split] = []
+        except OSError as error:  # a full disk should not end the run
+            with contextlib.suppress(OSError):
+                os.truncate(path, size)  # no half row
+            warnings.warn(
+                f"{path} cannot be written ({error.strerror}); its rows are kept and written with the next one.",
+                stacklevel=4,
+            )
         if self._logger is not None:
             values = {f"{split}/{name}": value for name, value in row.items() if name != "env_steps"}
             self._logger.log_metrics(values, step=row["env_steps"])
@@ -300,24 +317,24 @@ def library_versions() -> dict[str, str]:
     return versions
 
 
-def _lock(run_dir: Path) -> IO[str] | None:
-    """Keeps other processes out of the run directory until the file is closed, or the process ends."""
+def _lock(run_dir: Path) -> int | None:
+    """Keeps other processes out of the run directory until the descriptor is closed, or the process ends."""
     try:
         import fcntl
     except ImportError:  # Windows
         return None
-    file = (run_dir / ".lock").open("w")
+    descriptor = os.open(run_dir / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock, not inherited by environments' processes
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock, not inherited by environments' processes
     except (BlockingIOError, PermissionError) as error:
-        file.close()
+        os.close(descriptor)
         raise OSError(
             f"run_dir={run_dir} is in use by another process; wait for it or choose another run_dir."
         ) from error
     except OSError:  # a file system without locks
-        file.close()
+        os.close(descriptor)
         return None
-    return file
+    return descriptor
 
 
 def _require_logger(name: str) -> None:

@@ -14,7 +14,7 @@ from torchrl import torchrl_logger
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_etdmpc.collectors import NonFiniteError
+from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.envs import simulator_state
 from torchrl_etdmpc.training.builders import (
     build_agent,
@@ -77,6 +77,7 @@ class TrainingRun:
         self.episode_returns: list[float] = []  # training episodes since the last row of train.csv
         self.metrics: dict[str, torch.Tensor] = {}
         self.start = time.perf_counter()
+        self.faults = self.faults_in_a_row = 0
         self.learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
         self._compile_s = 0.0
@@ -111,7 +112,7 @@ class TrainingRun:
 
         Raises:
             RunInterrupted: if a signal asked the run to stop; it is saved.
-            NonFiniteError: if the environment or the policy breaks; the run is saved first.
+            NonFiniteError, SimulatorError: if environment, policy or updates keep failing; the run is saved first.
         """
         try:
             self.warm_up()
@@ -120,7 +121,7 @@ class TrainingRun:
                 self._seed()
                 self._pretrain()
                 self._learn(progress)
-        except NonFiniteError:
+        except (NonFiniteError, SimulatorError):
             self.save()
             raise
         finally:
@@ -153,8 +154,7 @@ class TrainingRun:
             tick = time.perf_counter()
             if config.overlap:
                 self.step(meanwhile=self.updates)
-            else:
-                self.step()
+            elif self.step():
                 self.updates()
             self.learning_s += time.perf_counter() - tick
             last = self.env_steps >= config.total_env_steps
@@ -241,10 +241,29 @@ class TrainingRun:
         rows["plan"] = {"loc": action, "scale": action + 1}
         self.agent.updater.warm_up(TensorDict(rows, slices))
 
-    def step(self, meanwhile: Callable[[], None] | None = None) -> None:
-        """One decision of every environment; ``meanwhile`` is called before the environments step."""
-        rows = self.collector.step(meanwhile)
-        self.episode_returns.extend(rows["next", "episode_reward"][rows["next", "done"]].tolist())
+    def step(self, meanwhile: Callable[[], None] | None = None) -> bool:
+        """One decision of every environment; ``meanwhile`` is called before the environments step.
+
+        Returns:
+            bool: whether it was made. A simulator that fails costs its episode, and counts.
+        """
+        try:
+            rows = self.collector.step(meanwhile)
+        except (NonFiniteError, SimulatorError) as error:
+            self._count_fault(error)
+            return False
+        done = rows["next", "done"]
+        self.episode_returns.extend(rows["next", "episode_reward"][done].tolist())
+        if done.any():
+            self.faults_in_a_row = 0
+        return True
+
+    def _count_fault(self, error: NonFiniteError | SimulatorError) -> None:
+        self.faults += 1
+        self.faults_in_a_row += 1
+        if self.faults_in_a_row >= self.config.max_faults:
+            raise error
+        warnings.warn(f"{error}; training goes on with a fresh episode (failure {self.faults}).", stacklevel=3)
 
     def update(self, *, distill: bool = True) -> None:
         """One gradient step on a fresh sample."""
@@ -311,6 +330,9 @@ class TrainingRun:
     def write_metrics(self) -> None:
         """Appends a row to ``train.csv``."""
         row = {name: float(value) for name, value in self.metrics.items()}
+        row["simulator_faults"] = self.faults
+        row["updates_skipped"] = int(self.agent.updater.skipped)
+        self._check_updates(row)
         finished = self.episode_returns
         row["episode_return"] = sum(finished) / len(finished) if finished else math.nan
         self.episode_returns = []
@@ -320,6 +342,18 @@ class TrainingRun:
             age = self.reanalyze.target_age
             row["target_age"] = math.nan if age is None else float(age)
         self.log.log_train(row, **self.counters())
+
+    def _check_updates(self, row: dict[str, float]) -> None:
+        in_a_row = int(self.agent.updater.skipped_in_a_row)
+        if in_a_row < self.config.max_skipped:
+            return
+        broken = [
+            name for name, value in row.items() if name.startswith(("loss_", "grad_")) and not math.isfinite(value)
+        ]
+        raise NonFiniteError(
+            f"the last {in_a_row} updates had no finite gradient and were skipped; not finite are {', '.join(broken)}. "
+            "A lower optim.lr or optim.grad_clip_norm may help."
+        )
 
     def save(self) -> None:
         """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time."""

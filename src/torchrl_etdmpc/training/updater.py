@@ -20,6 +20,9 @@ class Updater:
     the summed loss is the model step followed by the policy step on the detached latents. The gradients of the two are
     clipped separately; Adam with ``eps=1e-5`` serves the policy (TD-MPC2).
 
+    An update whose gradient is not finite is skipped: weights and optimisers stay as they are, and ``skipped`` and
+    ``skipped_in_a_row`` count it, on the device.
+
     Args:
         loss (EfficientTDMPCLoss): on the device and in the dtype that it will keep.
 
@@ -64,6 +67,8 @@ class Updater:
         )
         self.policy_optimizer = torch.optim.Adam(self.policy_parameters, eps=1e-5, **options)
         self.target_update = SoftUpdate(loss, tau=tau)
+        self.skipped = torch.zeros((), dtype=torch.int64, device=device)
+        self.skipped_in_a_row = torch.zeros_like(self.skipped)
         self._compiled = None if compile_mode is None else compile_call(self._gradients, compile_mode, keep=False)
 
     @property
@@ -92,16 +97,26 @@ class Updater:
         out = TensorDict(metrics, batch_size=[]).clone()
         for parameter, gradient in zip(self._trained(), gradients, strict=True):
             parameter.grad = gradient
-        out["grad_norm_model"] = torch.nn.utils.clip_grad_norm_(self.model_parameters, self.grad_clip_norm)
-        self.model_optimizer.step()
-        self.model_optimizer.zero_grad()
+        groups = {"model": (self.model_parameters, self.model_optimizer)}
         if distill:
-            out["grad_norm_policy"] = torch.nn.utils.clip_grad_norm_(self.policy_parameters, self.grad_clip_norm)
-            self.policy_optimizer.step()
-            self.policy_optimizer.zero_grad()
+            groups["policy"] = self.policy_parameters, self.policy_optimizer
+        for name, (parameters, _) in groups.items():
+            out[f"grad_norm_{name}"] = torch.nn.utils.clip_grad_norm_(parameters, self.grad_clip_norm)
+        self._count_skipped(torch.stack([out[f"grad_norm_{name}"] for name in groups]).isfinite().all(), groups)
+        for _, optimizer in groups.values():
+            optimizer.step()
+            optimizer.zero_grad()
         self.target_update.step()
         self.loss.world_model.version += 1
         return out
+
+    def _count_skipped(self, finite: Tensor, groups: dict[str, Any]) -> None:
+        """Tells the optimisers, on the device and as AMP's gradient scaler does, to leave the weights as they are."""
+        skip = finite.logical_not()
+        for _, optimizer in groups.values():
+            optimizer.grad_scale, optimizer.found_inf = None, skip.float()
+        self.skipped += skip
+        self.skipped_in_a_row.add_(1).mul_(skip)
 
     def warm_up(self, batch: TensorDictBase) -> None:
         """Compiles on a batch of the shapes to come; weights, running scale and optimisers stay as they are.
@@ -137,10 +152,14 @@ class Updater:
         return {key: value.detach() for key, value in out.items()}, gradients
 
     def state_dict(self) -> dict[str, Any]:
-        """State of both optimisers (the weights belong to the loss)."""
-        return {"model": self.model_optimizer.state_dict(), "policy": self.policy_optimizer.state_dict()}
+        """State of both optimisers and the counts of skipped updates (the weights belong to the loss)."""
+        counts = {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
+        return {"model": self.model_optimizer.state_dict(), "policy": self.policy_optimizer.state_dict()} | counts
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`."""
         self.model_optimizer.load_state_dict(state_dict["model"])
         self.policy_optimizer.load_state_dict(state_dict["policy"])
+        for name in ("skipped", "skipped_in_a_row"):
+            if name in state_dict:  # not in checkpoints of the first versions
+                getattr(self, name).copy_(state_dict[name])
