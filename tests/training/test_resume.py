@@ -2,8 +2,12 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import random
-from collections.abc import Callable
+import signal
+import subprocess
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -244,3 +248,132 @@ def test_without_any_checkpoint_the_error_says_so(tmp_path):
     RunLog.create(tmp_path, config=config.to_dict(), total_env_steps=140).close()
     with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\.$"):
         make_run(config, tmp_path, resume=True)
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A file system of 20 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=20m", "tmpfs", str(disk)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        mounted = False
+    if not mounted:
+        pytest.skip("mounting needs root")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def fill(disk: Path) -> None:
+    with (disk / "ballast").open("wb", buffering=0) as file:
+        for size in (2**20, 2**12, 1):
+            try:
+                while True:
+                    file.write(os.urandom(size))
+            except OSError:
+                continue
+
+
+def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight):
+    config = tiny_config(checkpoint_every=30)
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    step, calls = run.collector.step, [0]
+
+    def watched(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 40:
+            fill(small_disk)
+        if calls[0] == 65:
+            (small_disk / "ballast").unlink()
+        return step(*args)
+
+    run.collector.step = watched
+    with pytest.warns(UserWarning) as warned:
+        run.run()
+    texts = [str(warning.message) for warning in warned]
+    for steps in (90, 120):
+        assert f"no checkpoint at {steps} env steps (No space left on device); training goes on." in texts
+    assert results(run, run_dir) == straight(config)
+    (run_dir / "summary.json").unlink()
+    assert make_run(config, run_dir, resume=True).env_steps == 140
+
+
+def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_disk, straight):
+    config = tiny_config(checkpoint_every=30)
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    step, calls = run.collector.step, [0]
+
+    class Killed(BaseException):
+        pass
+
+    def watched(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 40:
+            fill(small_disk)
+        if calls[0] == 55:
+            raise Killed
+        return step(*args)
+
+    run.collector.step = watched
+    with pytest.warns(UserWarning, match="no checkpoint at 90 env steps"), pytest.raises(Killed):
+        run.run()
+    run.log.close()
+    (small_disk / "ballast").unlink()
+    resumed = make_run(config, run_dir, resume=True)
+    assert resumed.env_steps == 60
+    resumed.run()
+    assert results(resumed, run_dir) == straight(config)
+
+
+def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_that_works(tmp_path):
+    config = tiny_config()
+    run = make_run(config, tmp_path)
+    for _ in range(30):
+        run.step()
+    run.save()
+    for _ in range(10):
+        run.step()
+    outcomes = []
+    for moment in range(1, 12):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
+            child = os.fork()
+        if child == 0:
+            die_at(moment)
+            run.save()
+            os._exit(0)
+        killed = os.WIFSIGNALED(os.waitpid(child, 0)[1])
+        resumed = make_run(config, tmp_path, resume=True)
+        outcomes.append((killed, resumed.env_steps))
+        assert len(resumed.replay) == resumed.env_steps // 2
+        resumed.log.close()
+    assert outcomes[0] == (True, 60)
+    assert outcomes[-1] == (False, 80)
+    assert {steps for _, steps in outcomes} == {60, 80}
+    assert sorted(steps for _, steps in outcomes) == [steps for _, steps in outcomes]
+    run.save()  # and what the killed ones left behind goes
+    checkpoints = tmp_path / "checkpoints"
+    kept = [json.loads(file.read_text())["replay"] for file in checkpoints.glob("resume/*/manifest.json")]
+    named = {entry["file"] for files in kept for part in ("rows", "targets") for entry in files[part]}
+    assert {file.name for file in (checkpoints / "replay").iterdir()} == named
+    assert sorted(path.name for path in (checkpoints / "resume").iterdir()) == [f"{steps:012d}" for steps in (60, 80)]
+
+
+def die_at(moment: int) -> None:
+    """The process is killed when it is about to make its n-th change final."""
+    calls = [0]
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            calls[0] += 1
+            if calls[0] == moment:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*args, **kwargs)
+
+        return call
+
+    os.fsync, os.replace, os.link = counted(os.fsync), counted(os.replace), counted(os.link)

@@ -20,6 +20,7 @@ from torchrl_etdmpc.replay.reanalyze import TARGETS
 __all__ = ["DamagedFileError", "ReplayJournal", "read_checked", "write_checked"]
 
 ROWS_PER_FILE = 16_384
+PARTS = 3
 
 
 class DamagedFileError(RuntimeError):
@@ -30,9 +31,10 @@ class ReplayJournal:
     """Writes a buffer's rows once, and the planner targets that reanalyze rewrites as a base with changes.
 
     A transition never changes except for its targets. So every :meth:`save` appends a file with the rows written since
-    the last one, and a file with the targets computed since then; when those changes exceed a quarter of the buffer,
-    all targets are written anew. Files are never modified. What belongs to one state of the buffer is listed in the
-    dictionary that :meth:`save` returns; several such lists share files, and :meth:`prune` removes what no list names.
+    the last one, and files with the targets computed since then. The targets are kept in three parts; the one with the
+    most changes is written anew if they exceed a third of it, one part in a save. Files are never modified. What
+    belongs to one state of the buffer is listed in the dictionary that :meth:`save` returns; several such lists share
+    files, and :meth:`prune` removes what no list names.
 
     The buffer must be written in order (``add`` and ``extend``, one storage dimension), as
     :class:`~torchrl_etdmpc.collectors.StepCollector` does.
@@ -43,7 +45,7 @@ class ReplayJournal:
     Keyword Args:
         plan_key (NestedKey): group of the planner's targets, with the model version that they were computed by. Rows
             without it are written once and never again. Default: ``"plan"``.
-        rewrite_at (float): share of changed targets at which all of them are written. Default: 0.25.
+        rewrite_at (float): share of changed targets at which a part is written anew. Default: 1/3.
 
     >>> import tempfile
     >>> from torchrl.data import LazyTensorStorage
@@ -58,7 +60,7 @@ class ReplayJournal:
     [0, 1, 2, 3, 4, 5, 6]
     """
 
-    def __init__(self, folder: str | Path, *, plan_key: NestedKey = "plan", rewrite_at: float = 0.25) -> None:
+    def __init__(self, folder: str | Path, *, plan_key: NestedKey = "plan", rewrite_at: float = 1 / 3) -> None:
         self.folder = Path(folder)
         self.rewrite_at = rewrite_at
         self._target_keys = [unravel_key((plan_key, name)) for name in TARGETS]
@@ -92,7 +94,7 @@ class ReplayJournal:
             begin = max(old["written"], written - capacity)
             for start in range(begin, written, ROWS_PER_FILE):
                 end = min(start + ROWS_PER_FILE, written)
-                rows = stored.exclude(*targets)[torch.arange(start, end, device=stored.device) % capacity]
+                rows = stored.exclude("index", *targets)[torch.arange(start, end, device=stored.device) % capacity]
                 entry = self._write(f"rows-{start:012d}", rows)
                 new["rows"] = [*new["rows"], entry | {"begin": start, "end": end}]
             if targets:
@@ -105,14 +107,26 @@ class ReplayJournal:
     ) -> list[dict[str, Any]]:
         changed = stored.get(self._version_key).reshape(len(stored)) >= old["version"]
         changed[torch.arange(begin, written, device=changed.device) % capacity] = True
-        index = changed.nonzero().squeeze(-1)
-        pending = sum(entry["rows"] for entry in old["targets"][1:]) + len(index)
-        whole = not old["targets"] or pending > self.rewrite_at * len(stored)
-        if whole:
-            index = torch.arange(len(stored), device=changed.device)
-        content = stored[index].set("index", index)
-        entry = self._write(f"targets-{written:012d}", content) | {"rows": len(index)}
-        return [entry] if whole else [*old["targets"], entry]
+        size = -(-capacity // PARTS)
+        entries = {part: [entry for entry in old["targets"] if entry["part"] == part] for part in range(PARTS)}
+        indices, shares = {}, {}
+        for part in range(PARTS):
+            low, high = part * size, min((part + 1) * size, len(stored))
+            if low < high:
+                indices[part] = changed[low:high].nonzero().squeeze(-1) + low
+                pending = sum(entry["rows"] for entry in entries[part][1:]) + len(indices[part])
+                shares[part] = pending / (high - low) if entries[part] else float("inf")
+        fullest = max(shares, key=shares.__getitem__)
+        for part, index in indices.items():
+            low, high = part * size, min((part + 1) * size, len(stored))
+            name = f"targets-{written:012d}-{part}"
+            if not entries[part] or (part == fullest and shares[part] > self.rewrite_at):
+                entry = self._write(name, stored[low:high].clone())
+                entries[part] = [entry | {"part": part, "rows": high - low, "begin": low}]
+            elif len(index):
+                entry = self._write(name, stored[index].set("index", index.to(torch.int32)))
+                entries[part] = [*entries[part], entry | {"part": part, "rows": len(index)}]
+        return [entry for part in range(PARTS) for entry in entries[part]]
 
     def _write(self, name: str, content: TensorDictBase) -> dict[str, Any]:
         # A run that goes on from an older state must not meet the files of the future that it lost.
@@ -147,12 +161,14 @@ class ReplayJournal:
             content: TensorDict | None = None
             for entry in files["targets"]:
                 change = self._read(entry)
-                index = change.pop("index")
+                begin = entry.get("begin")
+                index = change.pop("index").long() if begin is None else slice(begin, begin + entry["rows"])
                 if content is None:
                     content = change.new_zeros(len(rows))
                 content[index] = change
             if content is not None:
                 rows = rows.update(content[position])
+            rows.set("index", position)  # TensorDict buffers number their rows
             buffer.storage.set(position.to(_device(buffer)), rows.to(_device(buffer)))
             state = {"_cursor": written % capacity, "_write_count": written}
             if buffer.writer.tracks_generations:  # how often each row has been written, from 0; -1 for never

@@ -96,8 +96,10 @@ class RunLog:
         if not (run_dir / "config.yaml").is_file():
             raise FileNotFoundError(f"run_dir={run_dir} holds no run to go on with; start it with resume=false.")
         log = cls(run_dir, total_env_steps=total_env_steps)
-        with replacing(run_dir / "config.yaml") as partial:
-            partial.write_text(_to_yaml(config), encoding="utf-8")
+        text = _to_yaml(config)
+        if text != (run_dir / "config.yaml").read_text(encoding="utf-8"):  # e.g. a longer budget
+            with replacing(run_dir / "config.yaml") as partial:
+                partial.write_text(text, encoding="utf-8")
         log._logger = _make_logger(logger, run_dir, config)
         return log
 
