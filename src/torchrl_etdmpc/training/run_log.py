@@ -19,6 +19,7 @@ import json
 import math
 import os
 import platform
+import secrets
 import warnings
 import weakref
 from collections.abc import Mapping
@@ -37,6 +38,7 @@ COUNTER_COLUMNS = ("env_steps", "decision_steps", "updates", "wall_time_s")
 EVAL_COLUMNS = (*COUNTER_COLUMNS, "return_mean", "return_std", "episodes")
 
 _LOCK = ".lock"
+_WANDB_TIMEOUT_S = 30
 _LOGGERS = ("none", "tensorboard", "wandb")
 _RUN_ENTRIES = ("config.yaml", "eval.csv", "train.csv", "summary.json", "checkpoints")
 _PACKAGES = ("torchrl-etdmpc", "torch", "torchrl", "tensordict", "dm-control", "mujoco")
@@ -355,13 +357,32 @@ def _make_logger(name: str, run_dir: Path, config: Mapping[str, Any]) -> Logger 
         return get_logger("tensorboard", logger_name=str(run_dir), experiment_name="tensorboard")
     import wandb
 
+    identity = run_dir / "wandb_id"  # a run that goes on is the same run there
+    if not identity.exists():
+        identity.write_text(secrets.token_hex(4), encoding="utf-8")
     # The installed packages and their source locations are the user's business, not the run's.
-    options = {"project": "torchrl_etdmpc", "log_env_packages": False}
+    options = {"project": "torchrl_etdmpc", "log_env_packages": False, "id": identity.read_text(encoding="utf-8")}
+    options["settings"] = wandb.Settings(init_timeout=_WANDB_TIMEOUT_S)
     if "WANDB_MODE" not in os.environ and not wandb.login(prompt=False, verify=False):
         options["mode"] = "offline"
-    logger = get_logger("wandb", logger_name=str(run_dir), experiment_name=run_dir.name, wandb_kwargs=options)
-    logger.log_hparams(dict(config))
-    return logger
+
+    def start() -> Logger:
+        logger = get_logger("wandb", logger_name=str(run_dir), experiment_name=run_dir.name, wandb_kwargs=options)
+        logger.log_hparams(dict(config))
+        return logger
+
+    try:
+        return start()
+    except wandb.errors.Error as error:
+        if options.get("mode") == "offline":
+            raise
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        warnings.warn(
+            f"wandb cannot be reached ({reason}), so it is offline; `wandb sync` sends it later.", stacklevel=4
+        )
+        options["mode"] = "offline"
+        wandb.teardown()  # the failed attempt holds the run's id
+        return start()
 
 
 def _to_yaml(config: Mapping[str, Any]) -> str:
