@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+
+from torchrl_etdmpc.training import (  # noqa: E402
+    TrainConfig,
+    build_agent,
+    export_planner,
+    export_policy,
+    load_agent,
+    preset,
+    save_checkpoint,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+WITHOUT = ("torchrl", "tensordict", "torchrl_etdmpc", "dm_control", "hydra")
+
+
+def make_agent():
+    torch.manual_seed(0)
+    config = TrainConfig.from_dict(preset("cpu").to_dict() | {"compile": "off", "task": "walker-walk"})
+    agent = build_agent(config, 24, 6)
+    for parameter in agent.world_model.parameters():
+        if parameter.ndim > 1:
+            torch.nn.init.normal_(parameter, std=parameter.shape[-2] ** -0.5)
+    return agent, config
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> Path:
+    agent, config = make_agent()
+    return save_checkpoint(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 0})
+
+
+@pytest.mark.parametrize("states", [1, 2, 7])
+def test_the_exported_policy_acts_like_the_live_one_for_any_number_of_states(states):
+    agent, _ = make_agent()
+    observation = torch.randn(states, 24)
+    with torch.no_grad():
+        expected, _ = agent.world_model.policy(agent.world_model.encode(observation))
+        torch.testing.assert_close(export_policy(agent).module()(observation), expected)
+
+
+@pytest.mark.parametrize("states", [1, 3])
+def test_the_exported_planner_plans_like_the_live_one_and_draws_new_noise(states):
+    agent, _ = make_agent()
+    program = export_planner(agent, batch_size=states).module()
+    observation, plan_mean = torch.randn(states, 24), torch.randn(states, 3, 6).clamp(-1, 1)
+    torch.manual_seed(1)
+    action, mean = program(observation, plan_mean)
+    torch.manual_seed(1)
+    plan = agent.eval_planner.plan(observation, plan_mean, explore=False)
+    torch.testing.assert_close(action, plan.action)
+    torch.testing.assert_close(mean, plan.mean)
+    assert not torch.equal(program(observation, plan_mean)[1], mean)
+
+
+def test_no_batch_is_refused():
+    with pytest.raises(ValueError, match=r"^batch_size must be at least 1, got 0\.$"):
+        export_planner(make_agent()[0], batch_size=0)
+
+
+def test_the_files_run_in_a_process_that_has_pytorch_only(checkpoint, tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / "examples" / "export.py"), f"checkpoint={checkpoint}", "out=exported"]
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout == (
+        "walker-walk: exported/policy.pt2 and exported/planner.pt2, observations [1, 24], actions [1, 6], "
+        "plan_mean [1, 3, 6]\n"
+    )
+    code = f"""
+import sys
+for name in {WITHOUT!r}:
+    sys.modules[name] = None
+import torch
+observation, plan_mean = torch.full((1, 24), 0.5), torch.zeros(1, 3, 6)
+print(torch.export.load("exported/policy.pt2").module()(observation).tolist())
+torch.manual_seed(0)
+print(torch.export.load("exported/planner.pt2").module()(observation, plan_mean)[0].tolist())
+"""
+    process = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    policy, planned = (torch.tensor(json.loads(line)) for line in process.stdout.splitlines())
+    agent, _, _ = load_agent(checkpoint)
+    observation = torch.full((1, 24), 0.5)
+    with torch.no_grad():
+        torch.testing.assert_close(policy, agent.world_model.policy(agent.world_model.encode(observation))[0])
+    torch.manual_seed(0)
+    plan = agent.eval_planner.plan(observation, torch.zeros(1, 3, 6), explore=False)
+    torch.testing.assert_close(planned, plan.action)
+
+
+def test_a_missing_checkpoint_is_one_line(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    command = [sys.executable, str(ROOT / "examples" / "export.py"), "checkpoint=none.pt"]
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 1
+    assert process.stderr == "error: none.pt is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt.\n"
+    assert not (tmp_path / "exported").exists()
