@@ -36,7 +36,8 @@ def main(config: TrainConfig) -> None:
     """One run, from an empty directory, or from where it was stopped, to `summary.json`."""
     run_dir = Path(config.run_dir or f"runs/{config.task}/{config.preset}/seed{config.seed}")
     resume = config.resume == "on" or (config.resume == "auto" and CheckpointStore(run_dir / "checkpoints").exists())
-    if resume:
+    begun = resume or (config.resume == "auto" and (run_dir / "config.yaml").exists())  # perhaps killed very early
+    if begun:
         saved = read_run_config(run_dir)
         config = resumed_config(saved, config, explicit_settings())
         if (run_dir / "summary.json").exists() and config.total_env_steps <= saved.total_env_steps:
@@ -49,9 +50,11 @@ def main(config: TrainConfig) -> None:
     torch.manual_seed(config.seed)
     env = make_dmc_env(config.task, seed=config.seed, num_envs=config.num_envs)
     eval_env = make_dmc_env(config.task, seed=config.seed + 10_000, num_envs=config.eval_episodes, parallel=False)
-    log = (RunLog.reopen if resume else RunLog.create)(
+    log = (RunLog.reopen if begun else RunLog.create)(
         run_dir, config=config.to_dict(), logger=config.logger, total_env_steps=config.total_env_steps
     )
+    if begun and not resume:
+        log.start_over()
     try:
         summary = TrainingRun(config, env=env, eval_env=eval_env, log=log, resume=resume).run()
     except RunInterrupted as stop:

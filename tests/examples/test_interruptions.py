@@ -104,6 +104,16 @@ def test_a_run_that_is_killed_three_times_ends_as_if_it_had_not_been(tmp_path, s
     assert results(tmp_path / "run") == straight
 
 
+def test_a_run_that_is_killed_before_its_first_checkpoint_starts_over(tmp_path, straight):
+    process = start(tmp_path, "run_dir=run", "resume=auto")
+    wait_for((tmp_path / "run" / "eval.csv").exists, process)
+    process.kill()
+    process.communicate()
+    assert checkpoints(tmp_path / "run") == []
+    finish(start(tmp_path, "run_dir=run", "resume=auto"))
+    assert results(tmp_path / "run") == straight
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("compile=off",), ("compile=default",), ("num_envs=3",)], ids=" ".join)
 def test_a_run_that_is_killed_twenty_times_ends_as_if_it_had_not_been(tmp_path, arguments):

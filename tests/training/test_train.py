@@ -359,11 +359,12 @@ class Crash(Transform):
 
 
 def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path):
-    run = make_run(tiny_config(max_faults=2, total_env_steps=240), tmp_path, Crash(5, 50, 95))
+    run = make_run(tiny_config(max_faults=2, total_env_steps=240), tmp_path, Crash(5, 42, 95))
     with pytest.warns(UserWarning, match=r"^the environment failed at decision step \d+: the physics is inv") as warned:
         summary = run.run()
     assert len(warned) == 3
     assert summary["env_steps"] == 240
+    assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 80, 160, 240]
     assert len(run.replay) == 120
     assert run.agent.updater.updates == 7 + 2 * 90
     rows = run.replay[:]

@@ -257,6 +257,11 @@ class RunLog:
             (self.run_dir / _LOCK).unlink(missing_ok=True)
             self._unlock()
 
+    def start_over(self) -> None:
+        """Removes the rows of a run that ended before its first checkpoint."""
+        empty = {"sizes": {"train.csv": 0, "eval.csv": 0}, "unwritten": {"train": [], "eval": []}}
+        self.load_state_dict(empty)
+
     def state_dict(self) -> dict[str, Any]:
         """How long the files are: a run that goes on from here forgets what was written later."""
         files = {name: self.run_dir / name for name in ("train.csv", "eval.csv")}

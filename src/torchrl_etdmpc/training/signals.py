@@ -19,7 +19,7 @@ class RunInterrupted(Exception):
 
 
 class StopSignals:
-    """Notes the first signal; a second one ends the process at once.
+    """Notes the first signal; a second one ends the process at once, and so does the first if there is nothing to save.
 
     Only the main thread can handle signals; in another one this does nothing.
 
@@ -30,6 +30,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.requested = False
+        self.nothing_to_save = False
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> StopSignals:
@@ -52,5 +53,7 @@ class StopSignals:
         if self.requested:
             os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
             os._exit(128 + number)
+        if self.nothing_to_save:
+            raise SystemExit(EXIT_CODE)
         self.requested = True
         torchrl_logger.info(f"{name}: finishing this step, saving and stopping; send it again to stop at once")

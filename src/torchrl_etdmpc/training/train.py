@@ -115,8 +115,10 @@ class TrainingRun:
             NonFiniteError, SimulatorError: if environment, policy or updates keep failing; the run is saved first.
         """
         try:
-            self.warm_up()
             with self._stop, progress_bar(self.config.total_env_steps, initial=self.env_steps) as progress:
+                self._stop.nothing_to_save = True
+                self.warm_up()
+                self._stop.nothing_to_save = False
                 self._catch_up()
                 self._seed()
                 self._pretrain()
@@ -152,14 +154,15 @@ class TrainingRun:
         config = self.config
         while self.env_steps < config.total_env_steps:
             tick = time.perf_counter()
-            if config.overlap:
-                self.step(meanwhile=self.updates)
-            elif self.step():
+            made = self.step(meanwhile=self.updates if config.overlap else None)
+            if made and not config.overlap:
                 self.updates()
             self.learning_s += time.perf_counter() - tick
-            last = self.env_steps >= config.total_env_steps
-            due = {"write_metrics": config.log_every, "evaluate": config.eval_every, "save": config.checkpoint_every}
-            self.pending += [name for name, interval in due.items() if last or self._passed(interval)]
+            if made:
+                last = self.env_steps >= config.total_env_steps
+                due = {"write_metrics": config.log_every, "evaluate": config.eval_every}
+                due["save"] = config.checkpoint_every
+                self.pending += [name for name, interval in due.items() if last or self._passed(interval)]
             self._after_work()
             latest = self.eval_returns[-1] if self.eval_returns else None
             progress.update(env_steps=self.env_steps, decision_steps=self.collector.frames, last_return=latest)
