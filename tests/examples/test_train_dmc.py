@@ -86,9 +86,14 @@ def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(fini
         "eval.csv",
         "summary.json",
         "curve.png",
-        str(Path("checkpoints", "last.pt")),
+        "checkpoints/last.pt",
+        "checkpoints/best.pt",
+        *(f"checkpoints/resume/000000000120/{name}" for name in ("agent.pt", "run.pt", "manifest.json")),
     }
-    assert set(file_hashes(directory)) == {str(run_dir / name) for name in expected}
+    files = set(file_hashes(directory))
+    replay = {name for name in files if name.startswith("runs/first/checkpoints/replay/")}
+    assert files - replay == {str(run_dir / name) for name in expected}
+    assert replay
     summary = json.loads((directory / run_dir / "summary.json").read_text())
     *progress, closing = process.stdout.splitlines()
     assert re.fullmatch(
