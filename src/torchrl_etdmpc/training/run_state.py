@@ -34,6 +34,7 @@ def capture(run: TrainingRun) -> dict[str, Any]:
             "metrics": dict(run.metrics),
             "wall_s": run.wall_s,
             "learning_s": run.learning_s,
+            "best_saved": run.best_saved,
             "faults": [run.faults, run.faults_in_a_row],
         },
         "random": GlobalRNGState().state_dict(),
@@ -55,7 +56,7 @@ def restore(run: TrainingRun, state: dict[str, Any]) -> None:
     run.stage, run.pretrained, run.pending = place["stage"], place["pretrained"], list(place["pending"])
     run.eval_returns, run.episode_returns = list(place["eval_returns"]), list(place["episode_returns"])
     run.metrics = {name: value.to(run.device) for name, value in place["metrics"].items()}
-    run.learning_s = place["learning_s"]
+    run.learning_s, run.best_saved = place["learning_s"], place["best_saved"]
     run.faults, run.faults_in_a_row = place["faults"]
     run.start = time.perf_counter() - place["wall_s"]
     GlobalRNGState().load_state_dict(state["random"])  # last: building the parts has drawn from them

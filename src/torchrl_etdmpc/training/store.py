@@ -2,7 +2,7 @@
 
 ==========================  ================================================================================
 ``last.pt``                 the agent of the newest checkpoint, see :func:`save_checkpoint`
-``best.pt``                 the agent of the best evaluation that a checkpoint followed
+``best.pt``                 the agent of the checkpoint with the best evaluation before it
 ``resume/<env steps>/``     ``agent.pt``; ``run.pt``, everything else that the continuation depends on; and
                             ``manifest.json``, which names every file with its checksum
 ``replay/``                 the buffer, see :class:`~torchrl_etdmpc.replay.ReplayJournal`

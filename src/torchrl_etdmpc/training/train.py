@@ -77,6 +77,7 @@ class TrainingRun:
         self.episode_returns: list[float] = []  # training episodes since the last row of train.csv
         self.metrics: dict[str, torch.Tensor] = {}
         self.start = time.perf_counter()
+        self.best_saved = -math.inf  # latest evaluation before the best checkpoint
         self.faults = self.faults_in_a_row = 0
         self.learning_s = 0.0  # acting and updating, without seed phase, pretraining and evaluations
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
@@ -361,7 +362,9 @@ class TrainingRun:
     def save(self) -> None:
         """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time."""
         self._saved_at = time.perf_counter()
-        best = bool(self.eval_returns) and self.eval_returns[-1] >= max(self.eval_returns)
+        latest = self.eval_returns[-1] if self.eval_returns else -math.inf
+        best = latest >= self.best_saved
+        self.best_saved = max(latest, self.best_saved)
         try:
             self.store.save(self.agent, self.config, self.counters(), self.replay, capture(self), best=best)
         except OSError as error:
