@@ -49,7 +49,8 @@ def tensors(agent: Agent) -> dict[str, Tensor]:
     """All tensors that training goes on from, by name."""
     found = {f"loss.{name}": value for name, value in agent.loss.state_dict().items()}
     found |= {f"world_model.{name}": value for name, value in agent.world_model.state_dict().items()}
-    for name, state in agent.updater.state_dict().items():
+    optimisers = {name: state for name, state in agent.updater.state_dict().items() if isinstance(state, dict)}
+    for name, state in optimisers.items():
         for index, moments in state["state"].items():
             found |= {f"{name}_optimiser.{index}.{moment}": value for moment, value in moments.items()}
     return found
