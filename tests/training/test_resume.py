@@ -20,10 +20,12 @@ pytest.importorskip("dm_control")
 from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     CheckpointError,
+    CheckpointStore,
     RunInterrupted,
     RunLog,
     TrainConfig,
     TrainingRun,
+    build_replay,
     read_run_config,
     resumed_config,
 )
@@ -338,7 +340,7 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     for _ in range(10):
         run.step()
     outcomes = []
-    for moment in range(1, 12):
+    for moment in range(1, 18):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
             child = os.fork()
@@ -361,6 +363,26 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     named = {entry["file"] for files in kept for part in ("rows", "targets") for entry in files[part]}
     assert {file.name for file in (checkpoints / "replay").iterdir()} == named
     assert sorted(path.name for path in (checkpoints / "resume").iterdir()) == [f"{steps:012d}" for steps in (60, 80)]
+
+
+def test_saving_the_same_step_again_never_leaves_it_without_a_checkpoint(tmp_path):
+    config = tiny_config()
+    run = make_run(config, tmp_path)
+    for _ in range(30):
+        run.step()
+    run.save()
+    for moment in range(1, 18):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            child = os.fork()
+        if child == 0:
+            die_at(moment)
+            run.save()
+            os._exit(0)
+        os.waitpid(child, 0)
+        store = CheckpointStore(tmp_path / "checkpoints")
+        assert store.exists()
+        assert store.load(run.agent, build_replay(config)).counters["env_steps"] == 60
 
 
 def die_at(moment: int) -> None:

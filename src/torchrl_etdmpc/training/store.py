@@ -104,7 +104,8 @@ class CheckpointStore:
             (partial / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
             for name in ("manifest.json", "agent.pt"):
                 _sync(partial / name)
-            shutil.rmtree(target, ignore_errors=True)  # the same step again, after going on from it
+            if target.exists():  # the same step again, e.g. in pretraining
+                os.replace(target, target.with_name(f".{target.name}.old"))
             os.replace(partial, target)
             _sync(target.parent)
             _link(target / "agent.pt", self.folder / "last.pt")
@@ -146,6 +147,12 @@ class CheckpointStore:
         return bool(self._folders())
 
     def _folders(self) -> list[Path]:
+        for old in (self.folder / "resume").glob(".*.old"):  # moved aside for one of the same step
+            target = old.with_name(old.name[1:].removesuffix(".old"))
+            if target.exists():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                os.replace(old, target)
         return sorted((self.folder / "resume").glob("[0-9]*"))
 
     @staticmethod
