@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import json
 import os
 import random
 import signal
@@ -19,6 +20,9 @@ import torch
 pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer  # noqa: E402
+
+from torchrl_etdmpc.replay import ReplayJournal  # noqa: E402
 from torchrl_etdmpc.training import EXIT_CODE  # noqa: E402
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -66,7 +70,7 @@ def checkpoints(run_dir: Path) -> list[str]:
 
 
 def results(run_dir: Path) -> dict[str, object]:
-    """Curves without their wall times, and weights."""
+    """Curves without their wall times, weights and the buffer."""
 
     def rows(name: str) -> list[dict[str, str]]:
         with (run_dir / name).open(newline="") as file:
@@ -74,7 +78,12 @@ def results(run_dir: Path) -> dict[str, object]:
 
     content = torch.load(run_dir / "checkpoints" / "last.pt", weights_only=True)
     weights = {name: value.tolist() for name, value in content["loss"].items()}
-    return {"train": rows("train.csv"), "eval": rows("eval.csv"), "weights": weights}
+    manifest = json.loads((run_dir / "checkpoints" / "resume" / checkpoints(run_dir)[-1] / "manifest.json").read_text())
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(manifest["replay"]["capacity"]))
+    ReplayJournal(run_dir / "checkpoints" / "replay").load(buffer, manifest["replay"])
+    stored = buffer[:]
+    replay = {str(key): stored[key].tolist() for key in stored.keys(True, True)}
+    return {"train": rows("train.csv"), "eval": rows("eval.csv"), "weights": weights, "replay": replay}
 
 
 @pytest.fixture(scope="module")

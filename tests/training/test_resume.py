@@ -331,6 +331,54 @@ def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_d
     assert results(resumed, run_dir) == straight(config)
 
 
+def test_best_and_last_follow_the_first_checkpoint_that_a_full_disk_lets_through(small_disk):
+    run = make_run(tiny_config(), small_disk / "run")
+    for _ in range(30):
+        run.step()
+    run.eval_returns = [1.0]
+    assert run.save()
+    run.eval_returns = [1.0, 2.0]
+    fill(small_disk)
+    with pytest.warns(UserWarning, match="no checkpoint at 60 env steps"):
+        assert not run.save()
+    best = small_disk / "run" / "checkpoints" / "best.pt"
+    before = best.stat().st_ino
+    (small_disk / "ballast").unlink()
+    run.eval_returns = [1.0, 2.0, 2.0]
+    assert run.save()
+    assert best.stat().st_ino != before
+
+
+def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(small_disk):
+    run = make_run(tiny_config(), small_disk / "run")
+    stop_at(run, run.collector, "step", 30)
+    fill(small_disk)
+    expected = r"^stopped at \d+ env steps and not saved: the checkpoint before it stays in "
+    with pytest.warns(UserWarning) as warned, pytest.raises(RunInterrupted, match=expected):
+        run.run()
+    assert "no checkpoint at 60 env steps (No space left on device)" in str(warned[-1].message)
+
+
+def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written(small_disk, straight):
+    config = tiny_config()
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    stop_at(run, run.collector, "step", 40)
+    with pytest.raises(RunInterrupted):
+        run.run()
+    run.log.close()
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    for begin in (lambda: make_run(config, run_dir, resume=True), lambda: make_run(config, small_disk / "new")):
+        with pytest.raises(
+            OSError, match=r"^run_dir=.* cannot be written \(Read-only file system\); choose a directory"
+        ):
+            begin()
+    subprocess.run(["mount", "-o", "remount,rw", str(small_disk)], check=True)
+    resumed = make_run(config, run_dir, resume=True)
+    resumed.run()
+    assert results(resumed, run_dir) == straight(config)
+
+
 def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_that_works(tmp_path):
     config = tiny_config()
     run = make_run(config, tmp_path)

@@ -14,7 +14,8 @@ import yaml
 
 from torchrl_etdmpc.training import run_log
 from torchrl_etdmpc.training.curve import plot_curve
-from torchrl_etdmpc.training.run_log import RunLog, library_versions
+from torchrl_etdmpc.training.run_log import RunLog
+from torchrl_etdmpc.training.versions import library_versions
 
 CONFIG = {"task": "walker-walk", "preset": "efficient-tdmpc-utd4", "seed": 1, "planner": {"horizon": 3, "lr": 3e-4}}
 COUNTERS = {"env_steps": 1000, "decision_steps": 500, "updates": 400, "wall_time_s": 9.5}
@@ -114,7 +115,7 @@ def test_a_logger_that_fails_to_start_leaves_the_directory_free(tmp_path, monkey
     def fail(*args):
         raise RuntimeError("no connection")
 
-    monkeypatch.setattr(run_log, "_make_logger", fail)
+    monkeypatch.setattr(run_log, "make_logger", fail)
     with pytest.raises(RuntimeError, match="no connection"):
         create(tmp_path / "run")
     monkeypatch.undo()

@@ -1,6 +1,7 @@
-"""Replay: slice sampling and reanalyze."""
+"""Replay: slice sampling, reanalyze, and a buffer on disk."""
 
+from torchrl_etdmpc.replay.journal import ReplayJournal
 from torchrl_etdmpc.replay.reanalyze import ReanalyzeTransform
 from torchrl_etdmpc.replay.slices import StepSliceSampler
 
-__all__ = ["ReanalyzeTransform", "StepSliceSampler"]
+__all__ = ["ReanalyzeTransform", "ReplayJournal", "StepSliceSampler"]

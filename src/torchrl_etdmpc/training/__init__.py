@@ -20,11 +20,12 @@ from torchrl_etdmpc.training.export import export_planner, export_policy
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.progress import progress_bar
 from torchrl_etdmpc.training.resume import read_run_config, resumed_config
-from torchrl_etdmpc.training.run_log import RunLog, library_versions
+from torchrl_etdmpc.training.run_log import RunLog
 from torchrl_etdmpc.training.signals import EXIT_CODE, RunInterrupted
 from torchrl_etdmpc.training.store import CheckpointStore
 from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
+from torchrl_etdmpc.training.versions import library_versions
 from torchrl_etdmpc.training.video import write_mp4
 
 __all__ = [

@@ -13,13 +13,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib.metadata
-import importlib.util
 import json
 import math
 import os
-import platform
-import secrets
 import warnings
 import weakref
 from collections.abc import Mapping
@@ -27,21 +23,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchrl import torchrl_logger
-from torchrl.record.loggers import Logger, get_logger
+from torchrl.record.loggers import Logger
 
 from torchrl_etdmpc.training.atomic_file import replacing
 from torchrl_etdmpc.training.curve import plot_curve
+from torchrl_etdmpc.training.loggers import LOGGERS, make_logger, require_logger
+from torchrl_etdmpc.training.run_lock import LOCK, lock_run
+from torchrl_etdmpc.training.versions import library_versions
 
-__all__ = ["COUNTER_COLUMNS", "EVAL_COLUMNS", "RunLog", "library_versions"]
+__all__ = ["COUNTER_COLUMNS", "EVAL_COLUMNS", "RunLog"]
 
 COUNTER_COLUMNS = ("env_steps", "decision_steps", "updates", "wall_time_s")
 EVAL_COLUMNS = (*COUNTER_COLUMNS, "return_mean", "return_std", "episodes")
 
-_LOCK = ".lock"
-_WANDB_TIMEOUT_S = 30
-_LOGGERS = ("none", "tensorboard", "wandb")
 _RUN_ENTRIES = ("config.yaml", "eval.csv", "train.csv", "summary.json", "checkpoints")
-_PACKAGES = ("torchrl-etdmpc", "torch", "torchrl", "tensordict", "dm-control", "mujoco")
 
 
 class RunLog:
@@ -75,7 +70,7 @@ class RunLog:
         self._logger = logger
         self._train_columns: tuple[str, ...] | None = None
         self._unwritten: dict[str, list[dict[str, float]]] = {"train": [], "eval": []}
-        lock = _lock(self.run_dir)
+        lock = lock_run(self.run_dir)
         self._unlock = None if lock is None else weakref.finalize(self, os.close, lock)
 
     @classmethod
@@ -102,7 +97,7 @@ class RunLog:
         if text != (run_dir / "config.yaml").read_text(encoding="utf-8"):  # e.g. a longer budget
             with replacing(run_dir / "config.yaml") as partial:
                 partial.write_text(text, encoding="utf-8")
-        log._logger = _make_logger(logger, run_dir, config)
+        log._logger = make_logger(logger, run_dir, config)
         return log
 
     @classmethod
@@ -133,12 +128,12 @@ class RunLog:
             FileExistsError: ``run_dir`` already holds a run; nothing in it is touched.
             OSError: ``run_dir`` cannot be written.
         """
-        if logger not in _LOGGERS:
-            raise ValueError(f"logger must be one of {', '.join(_LOGGERS)}, got {logger!r}; choose one of them.")
+        if logger not in LOGGERS:
+            raise ValueError(f"logger must be one of {', '.join(LOGGERS)}, got {logger!r}; choose one of them.")
         if total_env_steps < 1:
             raise ValueError(f"total_env_steps must be at least 1, got {total_env_steps}; choose a longer run.")
         if logger != "none":
-            _require_logger(logger)
+            require_logger(logger)
         text = _to_yaml(config)
         run_dir = Path(run_dir).expanduser()
         if any(os.path.lexists(run_dir / name) for name in _RUN_ENTRIES):
@@ -152,7 +147,7 @@ class RunLog:
                 f"run_dir={run_dir} cannot be written ({error.strerror}); choose a directory that you can write to."
             ) from error
         try:
-            backend = _make_logger(logger, run_dir, config)
+            backend = make_logger(logger, run_dir, config)
         except BaseException:
             (run_dir / "config.yaml").unlink()  # a run that never began must not block its directory
             raise
@@ -254,7 +249,7 @@ class RunLog:
             self._logger.shutdown()
             self._logger = None
         if self._unlock is not None and self._unlock.alive:
-            (self.run_dir / _LOCK).unlink(missing_ok=True)
+            (self.run_dir / LOCK).unlink(missing_ok=True)
             self._unlock()
 
     def start_over(self) -> None:
@@ -309,85 +304,6 @@ class RunLog:
         if self._logger is not None:
             values = {f"{split}/{name}": value for name, value in row.items() if name != "env_steps"}
             self._logger.log_metrics(values, step=row["env_steps"])
-
-
-def library_versions() -> dict[str, str]:
-    """Versions of Python and of those of our libraries that are installed, by distribution name.
-
-    >>> list(library_versions())[0]
-    'python'
-    """
-    versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
-
-
-def _lock(run_dir: Path) -> int | None:
-    """Keeps other processes out of the run directory until the descriptor is closed, or the process ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
-    descriptor = os.open(run_dir / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock, not inherited by environments' processes
-    except (BlockingIOError, PermissionError) as error:
-        os.close(descriptor)
-        raise OSError(
-            f"run_dir={run_dir} is in use by another process; wait for it or choose another run_dir."
-        ) from error
-    except OSError:  # a file system without locks
-        os.close(descriptor)
-        return None
-    return descriptor
-
-
-def _require_logger(name: str) -> None:
-    spec = importlib.util.find_spec(name)
-    # A plain folder called "wandb" (what wandb leaves behind in the working directory) is found too, without an origin.
-    if spec is None or spec.origin is None:
-        raise ImportError(
-            f"logger={name} needs {name}, which is not installed; run `pip install torchrl_etdmpc[{name}]`."
-        )
-
-
-def _make_logger(name: str, run_dir: Path, config: Mapping[str, Any]) -> Logger | None:
-    if name == "none":
-        return None
-    if name == "tensorboard":
-        return get_logger("tensorboard", logger_name=str(run_dir), experiment_name="tensorboard")
-    import wandb
-
-    identity = run_dir / "wandb_id"  # a run that goes on is the same run there
-    if not identity.exists():
-        identity.write_text(secrets.token_hex(4), encoding="utf-8")
-    # The installed packages and their source locations are the user's business, not the run's.
-    options = {"project": "torchrl_etdmpc", "log_env_packages": False, "id": identity.read_text(encoding="utf-8")}
-    options["settings"] = wandb.Settings(init_timeout=_WANDB_TIMEOUT_S)
-    if "WANDB_MODE" not in os.environ and not wandb.login(prompt=False, verify=False):
-        options["mode"] = "offline"
-
-    def start() -> Logger:
-        logger = get_logger("wandb", logger_name=str(run_dir), experiment_name=run_dir.name, wandb_kwargs=options)
-        logger.log_hparams(dict(config))
-        return logger
-
-    try:
-        return start()
-    except wandb.errors.Error as error:
-        if options.get("mode") == "offline":
-            raise
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        warnings.warn(
-            f"wandb cannot be reached ({reason}), so it is offline; `wandb sync` sends it later.", stacklevel=4
-        )
-        options["mode"] = "offline"
-        wandb.teardown()  # the failed attempt holds the run's id
-        return start()
 
 
 def _to_yaml(config: Mapping[str, Any]) -> str:

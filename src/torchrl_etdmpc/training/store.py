@@ -27,7 +27,7 @@ from torchrl_etdmpc.training.atomic_file import replacing
 from torchrl_etdmpc.training.builders import Agent
 from torchrl_etdmpc.training.checkpoint import CheckpointError, load_state, read_checkpoint, save_checkpoint
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.run_log import library_versions
+from torchrl_etdmpc.training.versions import library_versions
 
 FORMAT = 1
 
@@ -104,13 +104,13 @@ class CheckpointStore:
             (partial / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
             for name in ("manifest.json", "agent.pt"):
                 _sync(partial / name)
+            if best:  # before the checkpoint that says so
+                _link(partial / "agent.pt", self.folder / "best.pt")
             if target.exists():  # the same step again, e.g. in pretraining
                 os.replace(target, target.with_name(f".{target.name}.old"))
             os.replace(partial, target)
             _sync(target.parent)
             _link(target / "agent.pt", self.folder / "last.pt")
-            if best:
-                _link(target / "agent.pt", self.folder / "best.pt")
         except BaseException:
             self.journal.state = before
             shutil.rmtree(partial, ignore_errors=True)
@@ -177,8 +177,10 @@ class CheckpointStore:
     def _prune(self) -> None:
         """Removes old checkpoints, and the replay files that no checkpoint needs."""
         folders = self._folders()
-        for folder in folders[: -self.keep]:
+        for folder in [*folders[: -self.keep], *(self.folder / "resume").glob(".*.partial")]:
             shutil.rmtree(folder, ignore_errors=True)
+        for file in self.folder.glob(".*.partial"):  # of a process that was killed
+            file.unlink(missing_ok=True)
         kept = []
         for folder in folders[-self.keep :]:
             try:

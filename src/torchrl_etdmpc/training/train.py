@@ -9,10 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl import torchrl_logger
-from torchrl.envs import EnvBase, ExplorationType
-from torchrl.envs.utils import set_exploration_type
+from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.envs import simulator_state
@@ -31,6 +30,7 @@ from torchrl_etdmpc.training.run_log import RunLog
 from torchrl_etdmpc.training.run_state import capture, restore
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.store import CheckpointStore
+from torchrl_etdmpc.training.warm_up import warm_up
 
 
 class _EvaluationLeftError(Exception):
@@ -189,61 +189,15 @@ class TrainingRun:
 
     def _stop_if_asked(self) -> None:
         if self._stop.requested:
-            self.save()
+            saved = "saved" if self.save() else "not saved: the checkpoint before it stays"
             raise RunInterrupted(
-                f"stopped at {self.env_steps} env steps and saved in {self.log.run_dir}; go on with resume=true."
+                f"stopped at {self.env_steps} env steps and {saved} in {self.log.run_dir}; go on with resume=true."
             )
 
     def warm_up(self) -> None:
-        """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
-
-        With ``compile=auto`` a failure to compile is a warning, and the run goes on without.
-        """
-        if self.agent.compile_mode is None:
-            return
-        torchrl_logger.info("compiling, which takes minutes the first time and seconds from PyTorch's cache later")
-        tick = time.perf_counter()
-        calls = 1 if self.agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
-        try:
-            with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
-                for _ in range(calls):
-                    self._call_everything()
-        except Exception as error:
-            if self.config.compile != "auto":
-                raise
-            self.agent.make_eager()
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            warnings.warn(f"cannot compile here, so training is slower: {reason}", stacklevel=2)
-        self._compile_s = time.perf_counter() - tick
-        torchrl_logger.info(f"compiled in {self._compile_s:.0f} s")
-
-    def _call_everything(self) -> None:
-        """One call of every compiled part, in the shapes of the run."""
-        config, model = self.config, self.agent.world_model
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.zeros(shape, dtype=dtype, device=self.device)
-
-        def states(*batch: int) -> TensorDict:
-            carried = zeros(*batch, self.agent.planner.horizon, model.action_dim)
-            is_init = zeros(*batch, 1, dtype=torch.bool)
-            values = {"observation": zeros(*batch, model.observation_dim), "plan_mean": carried, "is_init": is_init}
-            return TensorDict(values, batch)
-
-        with set_exploration_type(ExplorationType.RANDOM):
-            self.agent.planner(states(*self.collector.env.batch_size))
-            if self.reanalyze is not None:
-                rows = config.reanalyze.num_slices * config.loss.slice_len
-                self.agent.reanalyze_planner(states(rows).select("observation"))
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            self.agent.eval_planner(states(*self.eval_env.batch_size))
-        slices = config.optim.batch_size, config.loss.slice_len
-        action = zeros(*slices, model.action_dim)
-        following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
-        following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
-        rows = {"observation": following["observation"], "action": action, "next": following}
-        rows["plan"] = {"loc": action, "scale": action + 1}
-        self.agent.updater.warm_up(TensorDict(rows, slices))
+        """Compiles what the run will call; see :func:`~torchrl_etdmpc.training.warm_up.warm_up`."""
+        batches = self.collector.env.batch_size, self.eval_env.batch_size
+        self._compile_s = warm_up(self.config, self.agent, *batches, device=self.device)
 
     def step(self, meanwhile: Callable[[], None] | None = None) -> bool:
         """One decision of every environment; ``meanwhile`` is called before the environments step.
@@ -359,17 +313,24 @@ class TrainingRun:
             "A lower optim.lr or optim.grad_clip_norm may help."
         )
 
-    def save(self) -> None:
-        """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time."""
+    def save(self) -> bool:
+        """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time.
+
+        Returns:
+            bool: whether it was written.
+        """
         self._saved_at = time.perf_counter()
         latest = self.eval_returns[-1] if self.eval_returns else -math.inf
-        best = latest >= self.best_saved
-        self.best_saved = max(latest, self.best_saved)
+        before = self.best_saved
+        self.best_saved = max(latest, before)
         try:
-            self.store.save(self.agent, self.config, self.counters(), self.replay, capture(self), best=best)
+            self.store.save(self.agent, self.config, self.counters(), self.replay, capture(self), best=latest >= before)
         except OSError as error:
+            self.best_saved = before
             reason = error.strerror or str(error)
             warnings.warn(f"no checkpoint at {self.env_steps} env steps ({reason}); training goes on.", stacklevel=2)
+            return False
+        return True
 
     def summary(self) -> dict[str, Any]:
         """What the run came to."""

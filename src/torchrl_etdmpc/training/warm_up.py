@@ -1,0 +1,86 @@
+"""Compilation before a run begins, so that its time is known and no step of the run is slow."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict
+from torchrl import torchrl_logger
+from torchrl.envs import ExplorationType
+from torchrl.envs.utils import set_exploration_type
+
+from torchrl_etdmpc.training.builders import Agent
+from torchrl_etdmpc.training.config import TrainConfig
+
+
+def warm_up(
+    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int], *, device: torch.device
+) -> float:
+    """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
+
+    With ``compile=auto`` a failure to compile is a warning, and the run goes on without.
+
+    Args:
+        config (TrainConfig): the run.
+        agent (Agent): its planners and its updater are called.
+        batch (sequence of int): batch size of the training environment.
+        eval_batch (sequence of int): batch size of the evaluation environment.
+
+    Keyword Args:
+        device (torch.device): of the agent.
+
+    Returns:
+        float: seconds that it took; 0 if nothing is compiled.
+    """
+    if agent.compile_mode is None:
+        return 0.0
+    torchrl_logger.info("compiling, which takes minutes the first time and seconds from PyTorch's cache later")
+    tick = time.perf_counter()
+    calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
+    try:
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            for _ in range(calls):
+                _call_everything(config, agent, batch, eval_batch, device)
+    except Exception as error:
+        if config.compile != "auto":
+            raise
+        agent.make_eager()
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        warnings.warn(f"cannot compile here, so training is slower: {reason}", stacklevel=3)
+    seconds = time.perf_counter() - tick
+    torchrl_logger.info(f"compiled in {seconds:.0f} s")
+    return seconds
+
+
+def _call_everything(
+    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int], device: torch.device
+) -> None:
+    """One call of every compiled part, in the shapes of the run."""
+    model = agent.world_model
+
+    def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.zeros(shape, dtype=dtype, device=device)
+
+    def states(*batch: int) -> TensorDict:
+        carried = zeros(*batch, agent.planner.horizon, model.action_dim)
+        is_init = zeros(*batch, 1, dtype=torch.bool)
+        values = {"observation": zeros(*batch, model.observation_dim), "plan_mean": carried, "is_init": is_init}
+        return TensorDict(values, batch)
+
+    with set_exploration_type(ExplorationType.RANDOM):
+        agent.planner(states(*batch))
+        if config.reanalyze.every:
+            rows = config.reanalyze.num_slices * config.loss.slice_len
+            agent.reanalyze_planner(states(rows).select("observation"))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        agent.eval_planner(states(*eval_batch))
+    slices = config.optim.batch_size, config.loss.slice_len
+    action = zeros(*slices, model.action_dim)
+    following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
+    following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
+    rows = {"observation": following["observation"], "action": action, "next": following}
+    rows["plan"] = {"loc": action, "scale": action + 1}
+    agent.updater.warm_up(TensorDict(rows, slices))
