@@ -48,6 +48,7 @@ def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     )
 
 
@@ -145,6 +146,19 @@ def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, straight,
     assert "Traceback" not in text
     finish(start(tmp_path, "run_dir=run", "resume=true"))
     assert results(tmp_path / "run") == straight
+
+
+def test_signals_that_reach_the_environments_too_are_left_to_the_run(tmp_path):
+    (tmp_path / "straight").mkdir()
+    finish(start(tmp_path / "straight", "run_dir=run", "num_envs=3"))
+    for number in (signal.SIGINT, signal.SIGTERM):  # as Ctrl-C and job schedulers send them
+        process = start(tmp_path, "run_dir=run", "num_envs=3", "resume=auto")
+        before = checkpoints(tmp_path / "run")
+        wait_for(lambda known=before: checkpoints(tmp_path / "run") != known, process)
+        os.killpg(process.pid, number)
+        assert "env steps and saved in run; go on with resume=true." in finish(process, EXIT_CODE)
+    finish(start(tmp_path, "run_dir=run", "resume=true"))
+    assert results(tmp_path / "run") == results(tmp_path / "straight" / "run")
 
 
 def test_a_second_signal_ends_the_process_at_once_and_the_last_checkpoint_stays(tmp_path, straight):

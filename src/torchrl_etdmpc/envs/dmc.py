@@ -7,6 +7,7 @@ import importlib.metadata
 import importlib.util
 import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Iterator
@@ -35,6 +36,8 @@ __all__ = ["make_dmc_env", "render_frame"]
 
 # The name that dm_control gives to its own concatenation of a task's observations.
 _FLAT_OBSERVATION = "observations"
+# How long a worker process outlives a signal to stop, in seconds.
+_GRACE_S = 10
 # The last dm_control release known to need MuJoCo 3.
 _LAST_FOR_MUJOCO_3 = (1, 0, 50)
 # Camera 0 of the quadruped looks from straight above; 2 follows it from the side.
@@ -106,7 +109,8 @@ def make_dmc_env(
     else:
         # The transforms run inside the processes, side by side. Left alone, ParallelEnv would change this process' own
         # number of threads.
-        env = ParallelEnv(num_envs, partial(_make_one, task, "cpu"), device=device, num_threads=torch.get_num_threads())
+        make = partial(_make_in_worker, task, os.getpid())
+        env = ParallelEnv(num_envs, make, device=device, num_threads=torch.get_num_threads())
     if seed is not None:
         env.set_seed(seed)
     return env
@@ -182,6 +186,17 @@ def _make_one(task: Task, device: torch.device | str) -> TransformedEnv:
     env = TransformedEnv(base, Compose(EpisodeState(), *transforms))
     _ = env.action_spec  # ActionScaling reads its bounds now, and its state can be loaded at any time
     return env
+
+
+def _make_in_worker(task: Task, owner: int) -> TransformedEnv:
+    """In a worker process, leaves the ``owner`` time to finish its step and save after a signal to stop.
+
+    Ctrl-C and job schedulers signal all processes of a job at once. TorchRL calls this once in the owner's process too.
+    """
+    if os.getpid() != owner and hasattr(signal, "SIGALRM"):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+            signal.signal(number, lambda *_: signal.alarm(_GRACE_S))
+    return _make_one(task, "cpu")
 
 
 def _require_dm_control() -> None:
