@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import math
+import os
 import struct
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import yaml
 
 from torchrl_etdmpc.training import run_log
 from torchrl_etdmpc.training.curve import plot_curve
+from torchrl_etdmpc.training.run_lock import lock_run, unlock_run
 from torchrl_etdmpc.training.run_log import RunLog
 from torchrl_etdmpc.training.versions import library_versions
 
@@ -41,8 +43,8 @@ def png_size(path: Path) -> tuple[int, int]:
 
 
 def test_create_writes_the_resolved_config_and_nothing_else(tmp_path):
-    create(tmp_path / "runs" / "walker")
-    assert [path.name for path in (tmp_path / "runs" / "walker").iterdir()] == [".lock", "config.yaml"]
+    log = create(tmp_path / "runs" / "walker")
+    assert sorted(path.name for path in log.run_dir.iterdir()) == [".lock", "config.yaml"]
     assert yaml.safe_load((tmp_path / "runs" / "walker" / "config.yaml").read_text()) == CONFIG
 
 
@@ -270,3 +272,21 @@ def test_the_curve_says_which_package_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"not installed; run `pip install matplotlib pyyaml`\.$"):
         plot_curve(tmp_path)
+
+
+def test_a_lock_that_its_owner_removed_in_the_last_moment_is_taken_again(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    lockf, calls = fcntl.lockf, []
+
+    def removed_first(*args):
+        calls.append(args)
+        if len(calls) == 1:
+            (tmp_path / ".lock").unlink()  # as the owner does between our opening the file and locking it
+        return lockf(*args)
+
+    monkeypatch.setattr(fcntl, "lockf", removed_first)
+    descriptor = lock_run(tmp_path)
+    assert len(calls) == 2
+    assert os.fstat(descriptor).st_ino == (tmp_path / ".lock").stat().st_ino
+    unlock_run(tmp_path, descriptor)
+    assert list(tmp_path.iterdir()) == []

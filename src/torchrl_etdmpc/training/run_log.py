@@ -28,7 +28,7 @@ from torchrl.record.loggers import Logger
 from torchrl_etdmpc.training.atomic_file import replacing
 from torchrl_etdmpc.training.curve import plot_curve
 from torchrl_etdmpc.training.loggers import LOGGERS, make_logger, require_logger
-from torchrl_etdmpc.training.run_lock import LOCK, lock_run
+from torchrl_etdmpc.training.run_lock import lock_run, unlock_run
 from torchrl_etdmpc.training.versions import library_versions
 
 __all__ = ["COUNTER_COLUMNS", "EVAL_COLUMNS", "RunLog"]
@@ -71,7 +71,7 @@ class RunLog:
         self._train_columns: tuple[str, ...] | None = None
         self._unwritten: dict[str, list[dict[str, float]]] = {"train": [], "eval": []}
         lock = lock_run(self.run_dir)
-        self._unlock = None if lock is None else weakref.finalize(self, os.close, lock)
+        self._unlock = None if lock is None else weakref.finalize(self, unlock_run, self.run_dir, lock)
 
     @classmethod
     def reopen(
@@ -248,8 +248,7 @@ class RunLog:
         if self._logger is not None:
             self._logger.shutdown()
             self._logger = None
-        if self._unlock is not None and self._unlock.alive:
-            (self.run_dir / LOCK).unlink(missing_ok=True)
+        if self._unlock is not None:
             self._unlock()
 
     def start_over(self) -> None:
