@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import copy
+import gc
 import shutil
+import sys
 import warnings
 from pathlib import Path
 
@@ -150,6 +152,20 @@ def test_a_run_that_was_warmed_up_compiles_nothing_more(warmed):
         run.update()
     assert run.reanalyze.refreshed > 0
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == graphs
+
+
+@needs_compiler
+def test_compiled_updates_leave_no_memory_behind(warmed):
+    updater, batch = warmed[0].agent.updater, random_slices(5, 1, num_slices=4)
+
+    def blocks(updates: int) -> int:
+        for _ in range(updates):
+            updater.step(batch)
+        gc.collect()
+        return sys.getallocatedblocks()
+
+    before = blocks(300)  # what is cached is cached by then
+    assert blocks(300) - before < 100
 
 
 @needs_compiler

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import shutil
@@ -53,6 +54,16 @@ def compile_call(function: Callable[..., Any], mode: str, *, keep: bool = True) 
         return tree_map_only(torch.Tensor, torch.clone, result) if keep else result
 
     return replay
+
+
+@functools.cache
+def tracing_gradients() -> contextlib.AbstractContextManager[None]:
+    """Lets Dynamo trace ``torch.autograd.grad``.
+
+    One object for all calls: in PyTorch 2.13 every patch of a configuration makes a context variable that stays in
+    memory, 200 bytes for each update.
+    """
+    return torch._dynamo.config.patch(trace_autograd_ops=True)
 
 
 _numbers = itertools.count()

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Slices
-from torchrl_etdmpc.training.compilation import compile_call
+from torchrl_etdmpc.training.compilation import compile_call, tracing_gradients
 
 
 class Updater:
@@ -92,7 +92,7 @@ class Updater:
         if self._compiled is None or not distill:
             metrics, gradients = self._gradients(*inputs)
         else:
-            with torch._dynamo.config.patch(trace_autograd_ops=True):
+            with tracing_gradients():
                 metrics, gradients = self._compiled(*inputs)
         out = TensorDict(metrics, batch_size=[]).clone()
         for parameter, gradient in zip(self._trained(), gradients, strict=True):
@@ -129,7 +129,7 @@ class Updater:
         distill, scale = self.loss.distill, self.loss.kl_scale.clone()
         self.loss.distill = True
         try:
-            with torch._dynamo.config.patch(trace_autograd_ops=True):
+            with tracing_gradients():
                 self._compiled(self.loss.slices(batch), self.loss.target_values())
         finally:
             self.loss.kl_scale.copy_(scale)
