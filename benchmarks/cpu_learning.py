@@ -66,7 +66,7 @@ def run(
 
 def folders() -> list[Path]:
     """The tasks with committed runs."""
-    found = sorted({file.parent.parent for file in RESULTS.glob("*/seed*/eval.csv")})
+    found = [RESULTS / task for task in sorted(TASKS) if any((RESULTS / task).glob("seed*/eval.csv"))]
     if not found:
         sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
     return found
