@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import itertools
 import shutil
 import sys
 import warnings
@@ -158,14 +159,14 @@ def test_a_run_that_was_warmed_up_compiles_nothing_more(warmed):
 def test_compiled_updates_leave_no_memory_behind(warmed):
     updater, batch = warmed[0].agent.updater, random_slices(5, 1, num_slices=4)
 
-    def blocks(updates: int) -> int:
-        for _ in range(updates):
+    counts = []
+    for _ in range(6):
+        for _ in range(100):
             updater.step(batch)
         gc.collect()
-        return sys.getallocatedblocks()
-
-    before = blocks(300)  # what is cached is cached by then
-    assert blocks(300) - before < 100
+        counts.append(sys.getallocatedblocks())
+    # Caches grow now and then; a leak grows by a block or more with every update.
+    assert min(after - before for before, after in itertools.pairwise(counts)) < 50
 
 
 @needs_compiler
