@@ -389,14 +389,7 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
         run.step()
     outcomes = []
     for moment in range(1, 18):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
-            child = os.fork()
-        if child == 0:
-            die_at(moment)
-            run.save()
-            os._exit(0)
-        killed = os.WIFSIGNALED(os.waitpid(child, 0)[1])
+        killed = killed_while_saving(run, moment)
         resumed = make_run(config, tmp_path, resume=True)
         outcomes.append((killed, resumed.env_steps))
         assert len(resumed.replay) == resumed.env_steps // 2
@@ -420,17 +413,22 @@ def test_saving_the_same_step_again_never_leaves_it_without_a_checkpoint(tmp_pat
         run.step()
     run.save()
     for moment in range(1, 18):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            child = os.fork()
-        if child == 0:
-            die_at(moment)
-            run.save()
-            os._exit(0)
-        os.waitpid(child, 0)
+        killed_while_saving(run, moment)
         store = CheckpointStore(tmp_path / "checkpoints")
         assert store.exists()
         assert store.load(run.agent, build_replay(config)).counters["env_steps"] == 60
+
+
+def killed_while_saving(run: TrainingRun, moment: int) -> bool:
+    """Saves in a copy of this process; whether it was killed before it was done."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
+        child = os.fork()
+    if child == 0:
+        die_at(moment)
+        run.save()
+        os._exit(0)
+    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
 def die_at(moment: int) -> None:

@@ -74,6 +74,7 @@ def make_dmc_env(
         num_envs: how many copies, at least 1. One is the environment itself, with batch size ``[]``. More are
             processes of a :class:`~torchrl.envs.ParallelEnv` with batch size ``[num_envs]``; a script that makes them
             needs the usual ``if __name__ == "__main__":`` guard, and should close them.
+            They outlive SIGINT, SIGTERM and SIGUSR1 by ten seconds, so that their owner can save first.
         parallel: ``False`` steps several environments one after the other in this process instead
             (:class:`~torchrl.envs.SerialEnv`); on few cores that is faster.
         device: where the tensors go; the physics runs on the CPU.

@@ -91,7 +91,7 @@ class RunLog:
         """
         run_dir = Path(run_dir).expanduser()
         if not (run_dir / "config.yaml").is_file():
-            raise FileNotFoundError(f"run_dir={run_dir} holds no run to go on with; start it with resume=false.")
+            raise FileNotFoundError(f"run_dir={run_dir} holds no run to go on with; start it with resume=off.")
         log = cls(run_dir, total_env_steps=total_env_steps)
         text = _to_yaml(config)
         if text != (run_dir / "config.yaml").read_text(encoding="utf-8"):  # e.g. a longer budget

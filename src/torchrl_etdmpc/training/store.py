@@ -143,8 +143,8 @@ class CheckpointStore:
         raise CheckpointError(f"cannot resume: {reason.rstrip('.')}.")
 
     def exists(self) -> bool:
-        """Whether there is something to go on from."""
-        return bool(self._folders())
+        """Whether there is something to go on from. Changes nothing: another process may be training here."""
+        return any((self.folder / "resume").glob("[0-9]*")) or any((self.folder / "resume").glob(".*.old"))
 
     def _folders(self) -> list[Path]:
         for old in (self.folder / "resume").glob(".*.old"):  # moved aside for one of the same step
