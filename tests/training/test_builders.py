@@ -27,7 +27,7 @@ from torchrl_etdmpc.training.builders import replay_device
 from torchrl_etdmpc.training.config import PlannerConfig, ReanalyzeConfig
 
 OBSERVATION_DIM, ACTION_DIM = 5, 2
-COMPILE_OPTIONS = {"options": {"fallback_random": True}, "dynamic": False, "fullgraph": True}
+COMPILE_OPTIONS = {"options": {"fallback_random": True, "cpp_wrapper": True}, "dynamic": False, "fullgraph": True}
 PLANNERS = ("planner", "eval_planner", "reanalyze_planner")
 
 
@@ -132,9 +132,9 @@ def test_the_loss_and_the_updater_take_their_settings():
     )
     assert {name: getattr(agent.loss, name).item() for name in loss} == loss
     assert (agent.loss.kl_direction, agent.loss.scale_tau) == ("forward", 0.125)
-    assert agent.updater.target_update.eps == 1 - 0.125
+    assert agent.updater.tau == 0.125
     assert agent.updater.grad_clip_norm == 7
-    assert [group["lr"] for group in agent.updater.model_optimizer.param_groups] == [0.125, 0.5]
+    assert [group["lr"] for group in agent.updater.optimizer.param_groups] == [0.125, 0.5, 0.5]
 
 
 def test_loss_and_planners_share_one_world_model():

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils._pytree import tree_map_only
 
 pytest.importorskip("dm_control")
 
@@ -84,7 +85,7 @@ def results(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
         "eval.csv": rows("eval.csv"),
         "summary": {key: summary[key] for key in ("env_steps", "final_return", "best_return")},
         "weights": {name: value.tolist() for name, value in run.agent.loss.state_dict().items()},
-        "optimisers": str(run.agent.updater.state_dict()),
+        "updater": tree_map_only(torch.Tensor, torch.Tensor.tolist, run.agent.updater.state_dict()),
         "replay": {str(key): stored.get(key).tolist() for key in stored.keys(True, True)},
         "generations": run.replay.writer.generations_of(torch.arange(len(run.replay))).tolist(),
         "random": torch.rand(3).tolist(),

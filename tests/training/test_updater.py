@@ -3,11 +3,13 @@ from __future__ import annotations
 import copy
 import io
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.functional import updated_scale
@@ -72,17 +74,35 @@ def targets_and_values(updater: Updater) -> list[tuple[Tensor, Tensor]]:
     return [(target, values[name]) for name, target in targets]
 
 
+def model_parameters(updater: Updater) -> list[Tensor]:
+    return [parameter for part in ("encoder", "heads", "values") for parameter in updater.parts[part]]
+
+
 def applied_gradients(updater: Updater) -> dict[str, list[list[Tensor]]]:
-    """Fills up with the gradients that each optimiser is handed at every update."""
+    """Fills up with the gradients of model and policy that the optimiser is handed at every update, by parameter."""
     recorded: dict[str, list[list[Tensor]]] = {"model": [], "policy": []}
-    for name, optimizer in (("model", updater.model_optimizer), ("policy", updater.policy_optimizer)):
 
-        def record(optimizer, args, kwargs, name=name):
-            groups = optimizer.param_groups
-            recorded[name].append([p.grad.clone() for group in groups for p in group["params"]])
+    def record(optimizer, args, kwargs):
+        gradients = {
+            flat.untyped_storage().data_ptr(): flat.grad for group in optimizer.param_groups for flat in group["params"]
+        }
 
-        optimizer.register_step_pre_hook(record)
+        def of(parameter: Tensor) -> Tensor | None:
+            gradient, begin = gradients[parameter.untyped_storage().data_ptr()], parameter.storage_offset()
+            return gradient if gradient is None else gradient[begin : begin + parameter.numel()].view_as(parameter)
+
+        for name, parameters in (("model", model_parameters(updater)), ("policy", updater.parts["policy"])):
+            found = [of(parameter) for parameter in parameters]
+            if any(gradient is not None for gradient in found):
+                recorded[name].append([gradient.clone() for gradient in found])
+
+    updater.optimizer.register_step_pre_hook(record)
     return recorded
+
+
+def numbers(state: dict[str, Any]) -> dict[str, Any]:
+    """Copies of all tensors as lists."""
+    return tree_map_only(Tensor, Tensor.tolist, state)
 
 
 def norm(gradients: list[Tensor]) -> Tensor:
@@ -102,16 +122,60 @@ def test_the_planner_s_world_model_and_the_loss_stay_one_set_of_weights():
     updater = make_updater()
     seeded_step(updater, make_batch())
     online = {p.data_ptr() for p in updater.loss.world_model.parameters()}
-    assert online == {p.data_ptr() for p in [*updater.model_parameters, *updater.policy_parameters]}
+    assert online == {p.data_ptr() for part in updater.parts.values() for p in part}
 
 
-def test_the_two_optimisers_share_the_weights_out_between_them():
+def test_the_parts_share_the_weights_out_between_them():
     updater = make_updater(make_world_model(termination=True))
-    model = {id(p) for p in updater.model_parameters}
-    policy = {id(p) for p in updater.policy_parameters}
-    assert not model & policy
-    assert model | policy == {id(p) for p in updater.loss.world_model.parameters()}
-    assert policy == {id(p) for p in updater.loss.world_model.policy.parameters()}
+    parts = {name: {id(p) for p in part} for name, part in updater.parts.items()}
+    world_model = updater.loss.world_model
+    assert sum(map(len, parts.values())) == len(set.union(*parts.values()))
+    assert set.union(*parts.values()) == {id(p) for p in world_model.parameters()}
+    for name, module in (
+        ("encoder", world_model.encoder),
+        ("values", world_model.value_head),
+        ("policy", world_model.policy),
+    ):
+        assert parts[name] == {id(p) for p in module.parameters()}
+
+
+def test_every_parameter_begins_where_memory_of_its_own_could():
+    updater = Updater(EfficientTDMPCLoss(make_world_model().float(), discount=0.9))
+    assert all(parameter.data_ptr() % 64 == 0 for part in updater.parts.values() for parameter in part)
+
+
+@pytest.mark.parametrize(
+    "move",
+    [
+        lambda loss: loss.to(torch.float32),
+        lambda loss: setattr(loss.world_model.encoder.output.weight, "data", torch.zeros(16, 10)),
+    ],
+    ids=["another dtype", "one layer"],
+)
+def test_parameters_with_other_memory_are_an_error_and_not_lost_updates(move):
+    updater = make_updater()
+    move(updater.loss)
+    with pytest.raises(RuntimeError, match=r"^the loss's parameters have been moved; make a new Updater"):
+        updater.step(make_batch())
+
+
+def test_a_copied_updater_is_refused_too():
+    updater = copy.deepcopy(make_updater())
+    with pytest.raises(RuntimeError, match="been moved"):
+        updater.step(make_batch())
+
+
+def test_a_new_updater_takes_over_the_weights_of_an_old_one():
+    first = make_updater()
+    seeded_step(first, make_batch())
+    second = Updater(first.loss, lr=LR, tau=TAU)
+    before = snapshot(second)
+    seeded_step(second, make_batch())
+    assert not torch.equal(
+        snapshot(second)["world_model.encoder.output.weight"], before["loss.encoder_params.output.weight"]
+    )
+    with pytest.raises(RuntimeError, match="been moved"):
+        seeded_step(first, make_batch())
 
 
 def test_each_update_counts_as_one_version_whether_it_distils_or_not():
@@ -178,7 +242,7 @@ def test_the_first_step_is_adam_s_with_the_learning_rate_and_epsilon_of_the_part
     # From rest, Adam moves by rate * g / (|g| + epsilon).
     world_model = make_world_model()
     updater = make_updater(world_model, policy_coef=1e-4)  # small gradients, so that the policy's epsilon shows
-    parameters = updater.policy_parameters if part == "policy" else updater.model_parameters
+    parameters = updater.parts["policy"] if part == "policy" else model_parameters(updater)
     encoder = {id(p) for p in world_model.encoder.parameters()}
     before = [parameter.detach().clone() for parameter in parameters]
     recorded = applied_gradients(updater)
@@ -205,7 +269,12 @@ def test_without_distillation_the_policy_and_its_running_scale_stay_as_they_are(
     assert any("kl_scale" in name for name in policy)
     assert any("policy" in name for name in policy)
     assert all(torch.equal(after[name], before[name]) for name in policy)
-    assert updater.policy_optimizer.state_dict()["state"] == {}
+    trained = {id(flat) for flat in updater.optimizer.state}
+    assert [all(id(flat) in trained for flat in group["params"]) for group in updater.optimizer.param_groups] == [
+        True,
+        True,
+        False,
+    ]
     assert not torch.equal(after["world_model.encoder.output.weight"], before["world_model.encoder.output.weight"])
 
 
@@ -321,7 +390,7 @@ def test_training_goes_on_bit_for_bit_from_a_saved_state():
     content = torch.load(file, weights_only=True)
 
     restored = make_updater()
-    assert not torch.equal(restored.policy_parameters[0], original.policy_parameters[0])
+    assert not torch.equal(restored.parts["policy"][0], original.parts["policy"][0])
     restored.loss.world_model.load_state_dict(content["world_model"])
     restored.loss.load_state_dict(content["loss"])
     restored.load_state_dict(content["optimisers"])
@@ -352,12 +421,12 @@ def test_an_update_without_a_finite_gradient_changes_nothing_but_the_count(poiso
         pytest.skip("the target is not read")
     updater.step(good, distill=distill)
     weights = [parameter.clone() for parameter in updater.loss.world_model.parameters()]
-    optimisers = copy.deepcopy([updater.model_optimizer.state_dict(), updater.policy_optimizer.state_dict()])
+    optimiser = numbers(updater.optimizer.state_dict())
     for number in (1, 2):
         updater.step(bad, distill=distill)
         assert (int(updater.skipped), int(updater.skipped_in_a_row)) == (number, number)
     assert all(map(torch.equal, weights, updater.loss.world_model.parameters()))
-    assert str(optimisers) == str([updater.model_optimizer.state_dict(), updater.policy_optimizer.state_dict()])
+    assert numbers(updater.optimizer.state_dict()) == optimiser
     assert updater.loss.kl_scale.isfinite()
     metrics = updater.step(good, distill=distill)
     assert metrics["loss_reward"].isfinite()

@@ -1,4 +1,4 @@
-"""Checkpoints: weights, optimisers and counters in one file that holds no code."""
+"""Checkpoints: weights, optimiser and counters in one file that holds no code."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torchrl_etdmpc.training.atomic_file import replacing
 from torchrl_etdmpc.training.builders import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
-FORMAT = 1
-_ENTRIES = {"config", "observation_dim", "action_dim", "world_model", "loss", "optimisers", "counters"}
+FORMAT = 2
+_ENTRIES = {"config", "observation_dim", "action_dim", "world_model", "loss", "updater", "counters"}
 
 
 class CheckpointError(RuntimeError):
@@ -43,7 +43,7 @@ def save_checkpoint(path: str | Path, agent: Agent, config: TrainConfig, counter
         "action_dim": agent.world_model.action_dim,
         "world_model": agent.world_model.state_dict(),
         "loss": agent.loss.state_dict(),  # shares its storage with the world model, so it is written once
-        "optimisers": agent.updater.state_dict(),
+        "updater": agent.updater.state_dict(),
         "counters": dict(counters),
     }
     with replacing(path) as partial:
@@ -80,10 +80,10 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def load_state(agent: Agent, content: dict[str, Any]) -> None:
-    """Gives an agent the weights, targets, running scale and optimisers of :func:`read_checkpoint`."""
+    """Gives an agent the weights, targets, running scale and optimiser of :func:`read_checkpoint`."""
     agent.world_model.load_state_dict(content["world_model"])
     agent.loss.load_state_dict(content["loss"])
-    agent.updater.load_state_dict(content["optimisers"])
+    agent.updater.load_state_dict(content["updater"])
 
 
 def load_agent(

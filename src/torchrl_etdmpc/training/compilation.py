@@ -14,6 +14,11 @@ from typing import Any
 import torch
 from torch.utils._pytree import tree_map_only
 
+_OPTIONS = {
+    "fallback_random": True,  # PyTorch's own random numbers: those of an eager run, and faster on a CPU than Inductor's
+    "cpp_wrapper": True,  # a hundred small operations are called from C++ and not from Python
+}
+
 
 def resolve_compile(setting: str, device: torch.device) -> str | None:
     """The ``torch.compile`` mode of ``auto``, ``off``, ``default`` or ``max``; ``None`` is eager.
@@ -43,8 +48,8 @@ def compile_call(function: Callable[..., Any], mode: str, *, keep: bool = True) 
             so they are copied. Default: ``True``.
     """
     function = _with_code_of_its_own(function)
-    if mode == "default":  # PyTorch's own random numbers: those of an eager run, and faster on a CPU than Inductor's
-        return torch.compile(function, options={"fallback_random": True}, dynamic=False, fullgraph=True)
+    if mode == "default":
+        return torch.compile(function, options=_OPTIONS, dynamic=False, fullgraph=True)
     compiled = torch.compile(function, mode=mode, dynamic=False, fullgraph=True)
 
     @functools.wraps(function)

@@ -68,7 +68,7 @@ class CheckpointStore:
         """Writes a checkpoint; what was saved before stays usable until the new one is in place.
 
         Args:
-            agent (Agent): weights and optimisers.
+            agent (Agent): weights and optimiser.
             config (TrainConfig): the run.
             counters (mapping): with ``env_steps``, which names the checkpoint.
             buffer (TensorDictReplayBuffer): the run's.

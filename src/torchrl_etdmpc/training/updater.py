@@ -1,4 +1,4 @@
-"""One gradient step of everything: loss, clipping, both optimisers, target average."""
+"""One gradient step of everything: loss, clipping, optimiser, target average."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Slices
 from torchrl_etdmpc.training.compilation import compile_call, tracing_gradients
+
+_ALIGNMENT = 16  # elements: every parameter begins at a multiple of 64 bytes, as memory of its own would
 
 
 class Updater:
@@ -20,8 +22,12 @@ class Updater:
     the summed loss is the model step followed by the policy step on the detached latents. The gradients of the two are
     clipped separately; Adam with ``eps=1e-5`` serves the policy (TD-MPC2).
 
-    An update whose gradient is not finite is skipped: weights and optimisers stay as they are, and ``skipped`` and
+    An update whose gradient is not finite is skipped: weights and optimiser stay as they are, and ``skipped`` and
     ``skipped_in_a_row`` count it, on the device.
+
+    The weights of each part move into one piece of memory, of which the parameters become views, so that clipping, Adam
+    and the target average are a few operations whatever the number of layers. Parameters that get new memory afterwards
+    (``.to()``, ``copy.deepcopy``) need a new updater; :meth:`step` says so.
 
     Args:
         loss (EfficientTDMPCLoss): on the device and in the dtype that it will keep.
@@ -31,8 +37,8 @@ class Updater:
         encoder_lr_scale (float): factor of the encoder's learning rate. Default: 0.3.
         grad_clip_norm (float): largest gradient norm of the model and of the policy. Default: 20.
         tau (float): rate of the target values. Default: 0.01.
-        compile_mode (str, optional): ``torch.compile`` mode of loss and gradient, one graph. Default: ``None``, eager.
-            An update without distillation is always eager: pretraining is short.
+        compile_mode (str, optional): ``torch.compile`` mode of loss and clipped gradient, one graph. Default: ``None``,
+            eager. An update without distillation is always eager: pretraining is short.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.testing import random_slices
@@ -53,20 +59,32 @@ class Updater:
     ) -> None:
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
-        networks = [
-            name for name in ("dynamics", "reward", "value", "termination") if f"{name}_params" in loss._modules
-        ]
-        encoder = list(loss.encoder_params.parameters())
-        heads = [parameter for name in networks for parameter in getattr(loss, f"{name}_params").parameters()]
-        self.model_parameters = encoder + heads
-        self.policy_parameters = list(loss.policy_params.parameters())
-        device = self.policy_parameters[0].device
-        options = {"lr": lr, "fused": True, "capturable": device.type == "cuda"}
-        self.model_optimizer = torch.optim.Adam(
-            [{"params": encoder, "lr": lr * encoder_lr_scale}, {"params": heads}], **options
+        self.tau = tau
+        SoftUpdate(loss, tau=tau)  # tells the loss that its targets follow
+        values = dict(loss.value_params.flatten_keys(".").items())
+        targets = dict(loss.target_value_params.flatten_keys(".").items())
+        heads = [name for name in ("dynamics", "reward", "termination") if f"{name}_params" in loss._modules]
+        self.parts: dict[str, list[nn.Parameter]] = {
+            "encoder": list(loss.encoder_params.parameters()),
+            "heads": [p for name in heads for p in getattr(loss, f"{name}_params").parameters()],
+            "values": list(values.values()),
+            "policy": list(loss.policy_params.parameters()),
+        }
+        self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
+        self._flat_targets = _moved_together([targets[name] for name in values])
+        self._views = [p for tensors in self.parts.values() for p in tensors]
+        self._addresses = [p.data_ptr() for p in self._views]
+        device = self._flat_targets.device
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [self._flat["encoder"]], "lr": lr * encoder_lr_scale},
+                {"params": [self._flat["heads"], self._flat["values"]]},
+                {"params": [self._flat["policy"]], "eps": 1e-5},
+            ],
+            lr=lr,
+            fused=True,
+            capturable=device.type == "cuda",
         )
-        self.policy_optimizer = torch.optim.Adam(self.policy_parameters, eps=1e-5, **options)
-        self.target_update = SoftUpdate(loss, tau=tau)
         self.skipped = torch.zeros((), dtype=torch.int64, device=device)
         self.skipped_in_a_row = torch.zeros_like(self.skipped)
         self._compiled = None if compile_mode is None else compile_call(self._gradients, compile_mode, keep=False)
@@ -85,41 +103,34 @@ class Updater:
 
         Returns:
             TensorDictBase: losses, metrics and gradient norms, detached scalars on the device.
+
+        Raises:
+            RuntimeError: if parameters of the loss have been given other memory.
         """
+        if [p.data_ptr() for p in self._views] != self._addresses:
+            raise RuntimeError("the loss's parameters have been moved; make a new Updater for this loss.")
         if self.loss.distill != distill:
             self.loss.distill = distill
         inputs = self.loss.slices(batch), self.loss.target_values()
         if self._compiled is None or not distill:
-            metrics, gradients = self._gradients(*inputs)
+            metrics, gradients, skip = self._gradients(*inputs)
         else:
             with tracing_gradients():
-                metrics, gradients = self._compiled(*inputs)
-        out = TensorDict(metrics, batch_size=[]).clone()
-        for parameter, gradient in zip(self._trained(), gradients, strict=True):
-            parameter.grad = gradient
-        groups = {"model": (self.model_parameters, self.model_optimizer)}
-        if distill:
-            groups["policy"] = self.policy_parameters, self.policy_optimizer
-        for name, (parameters, _) in groups.items():
-            out[f"grad_norm_{name}"] = torch.nn.utils.clip_grad_norm_(parameters, self.grad_clip_norm)
-        self._count_skipped(torch.stack([out[f"grad_norm_{name}"] for name in groups]).isfinite().all(), groups)
-        for _, optimizer in groups.values():
-            optimizer.step()
-            optimizer.zero_grad()
-        self.target_update.step()
+                metrics, gradients, skip = self._compiled(*inputs)
+        for part, gradient in gradients.items():
+            self._flat[part].grad = gradient
+        # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
+        self.optimizer.grad_scale, self.optimizer.found_inf = None, skip
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.skipped += skip.long()
+        self.skipped_in_a_row.add_(1).mul_(skip.long())
+        self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
         self.loss.world_model.version += 1
-        return out
-
-    def _count_skipped(self, finite: Tensor, groups: dict[str, Any]) -> None:
-        """Tells the optimisers, on the device and as AMP's gradient scaler does, to leave the weights as they are."""
-        skip = finite.logical_not()
-        for _, optimizer in groups.values():
-            optimizer.grad_scale, optimizer.found_inf = None, skip.float()
-        self.skipped += skip
-        self.skipped_in_a_row.add_(1).mul_(skip)
+        return TensorDict(metrics, batch_size=[]).clone()
 
     def warm_up(self, batch: TensorDictBase) -> None:
-        """Compiles on a batch of the shapes to come; weights, running scale and optimisers stay as they are.
+        """Compiles on a batch of the shapes to come; weights, running scale and optimiser stay as they are.
 
         Args:
             batch (TensorDictBase): slices, batch size [B, T]; the values do not matter.
@@ -139,27 +150,47 @@ class Updater:
         """Gives up compilation."""
         self._compiled = None
 
-    def _trained(self) -> list[torch.nn.Parameter]:
-        return self.model_parameters + (self.policy_parameters if self.loss.distill else [])
-
     def _gradients(
         self, slices: Slices, target_values: dict[str, Tensor]
-    ) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-        """Losses and metrics, and the gradient of the summed losses for every trained parameter."""
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
+        """Losses and metrics, the clipped gradient of the summed losses in the layout of each part, and 1.0 to skip."""
         out = self.loss.evaluate(slices, target_values)
         total = sum(value for key, value in out.items() if key.startswith("loss_"))
-        gradients = torch.autograd.grad(total, self._trained())
-        return {key: value.detach() for key, value in out.items()}, gradients
+        metrics = {key: value.detach() for key, value in out.items()}
+        clipped = {"model": ("encoder", "heads", "values")} | ({"policy": ("policy",)} if self.loss.distill else {})
+        parts = {part: self.parts[part] for names in clipped.values() for part in names}
+        every = iter(torch.autograd.grad(total, [p for tensors in parts.values() for p in tensors]))
+        gradients = {part: _joined([next(every) for _ in tensors]) for part, tensors in parts.items()}
+        for name, names in clipped.items():
+            norm = torch.stack([gradients[part].norm() for part in names]).norm()
+            factor = (self.grad_clip_norm / (norm + 1e-6)).clamp(max=1)  # as torch.nn.utils.clip_grad_norm_
+            gradients.update({part: factor * gradients[part] for part in names})
+            metrics[f"grad_norm_{name}"] = norm
+        norms = torch.stack([metrics[f"grad_norm_{name}"] for name in clipped])
+        return metrics, gradients, norms.isfinite().all().logical_not().float()
 
     def state_dict(self) -> dict[str, Any]:
-        """State of both optimisers and the counts of skipped updates (the weights belong to the loss)."""
+        """State of the optimiser and the counts of skipped updates (the weights belong to the loss)."""
         counts = {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
-        return {"model": self.model_optimizer.state_dict(), "policy": self.policy_optimizer.state_dict()} | counts
+        return {"optimizer": self.optimizer.state_dict()} | counts
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`."""
-        self.model_optimizer.load_state_dict(state_dict["model"])
-        self.policy_optimizer.load_state_dict(state_dict["policy"])
-        for name in ("skipped", "skipped_in_a_row"):
-            if name in state_dict:  # not in checkpoints of the first versions
-                getattr(self, name).copy_(state_dict[name])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.skipped.copy_(state_dict["skipped"])
+        self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
+
+
+def _joined(tensors: list[Tensor]) -> Tensor:
+    """The tensors end to end, zeros between them, as :func:`_moved_together` lays them out."""
+    return torch.cat([nn.functional.pad(t.flatten(), (0, -t.numel() % _ALIGNMENT)) for t in tensors])
+
+
+@torch.no_grad()
+def _moved_together(tensors: list[Tensor]) -> Tensor:
+    """Moves tensors into one new piece of memory, of which each becomes a view."""
+    flat, begin = _joined(tensors), 0
+    for tensor in tensors:
+        tensor.data = flat[begin : begin + tensor.numel()].view_as(tensor)
+        begin += tensor.numel() + -tensor.numel() % _ALIGNMENT
+    return flat
