@@ -11,7 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torchrl.envs import EnvBase
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    DMControlEnv,
+    DoubleToFloat,
+    EnvBase,
+    InitTracker,
+    RenameTransform,
+    RewardSum,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_etdmpc.envs import DMC_TASKS, get_task, make_dmc_env, render_frame
@@ -154,6 +164,43 @@ def test_an_episode_is_500_decisions_and_ends_truncated_not_terminated():
     assert not rollout["next", "terminated"].any()
     assert torch.equal(rollout["is_init"], torch.arange(500).unsqueeze(-1) == 0)
     torch.testing.assert_close(rollout["next", "episode_reward"][-1], rollout["next", "reward"].sum(0))
+
+
+def test_an_early_end_terminates_and_ends_the_action_repeat(monkeypatch):
+    from dm_env import StepType
+
+    env = make_dmc_env("pendulum-swingup", seed=0)
+    state = env.reset()
+    simulate, calls = env.base_env._env.step, []
+
+    def fall(action):
+        calls.append(action)
+        return simulate(action)._replace(step_type=StepType.LAST, discount=0.0, reward=0.25)
+
+    monkeypatch.setattr(env.base_env._env, "step", fall)
+    after = env.step(state.set("action", torch.zeros(1)))["next"]
+    assert len(calls) == 1
+    assert after["reward"].item() == 0.25
+    assert [after[name].item() for name in ("terminated", "truncated", "done")] == [True, False, True]
+
+
+@pytest.mark.parametrize("name", ["walker-walk", "quadruped-walk"])
+def test_the_environment_is_torchrls_with_transforms(name):
+    task = get_task(name)
+    base = DMControlEnv(
+        task.domain, task.task, frame_skip=2, device="cpu", environment_kwargs={"flat_observation": True}
+    )
+    # On the way in transforms apply from last to first, so actions are scaled in float64.
+    transforms = [RenameTransform(["observations"], ["observation"]), DoubleToFloat(), InitTracker(), RewardSum()]
+    reference = TransformedEnv(base, Compose(*([ActionScaling()] if "quadruped" in name else []), *transforms))
+    reference.set_seed(4)
+    ours = make_dmc_env(name, seed=4)
+    actions = _actions(ours, 50)
+    for step, expected in zip(_play(ours, actions), _play(reference, actions), strict=True):
+        assert set(step.keys(True, True)) == set(expected.keys(True, True))
+        for key, value in expected.items(True, True):
+            assert step[key].dtype == value.dtype, key
+            torch.testing.assert_close(step[key], value, rtol=0, atol=0, msg=str(key))
 
 
 def test_the_episode_reward_starts_over_with_each_episode():

@@ -16,14 +16,11 @@ from functools import partial
 import torch
 from torch import Tensor
 from torchrl.envs import (
-    ActionScaling,
     Compose,
     DMControlEnv,
-    DoubleToFloat,
     EnvBase,
     InitTracker,
     ParallelEnv,
-    RenameTransform,
     RewardSum,
     SerialEnv,
     TransformedEnv,
@@ -34,8 +31,6 @@ from torchrl_etdmpc.envs.tasks import Task, get_task
 
 __all__ = ["make_dmc_env", "render_frame"]
 
-# The name that dm_control gives to its own concatenation of a task's observations.
-_FLAT_OBSERVATION = "observations"
 # How long a worker process outlives a signal to stop, in seconds.
 _GRACE_S = 10
 # The last dm_control release known to need MuJoCo 3.
@@ -174,19 +169,7 @@ def _make_one(task: Task, device: torch.device | str) -> TransformedEnv:
             # One array from dm_control itself is cheaper than CatTensors over up to nine entries.
             environment_kwargs={"flat_observation": True},
         )
-    transforms = [
-        RenameTransform([_FLAT_OBSERVATION], ["observation"]),
-        DoubleToFloat(),
-        InitTracker(),
-        RewardSum(),
-    ]
-    bounds = base.action_spec.space
-    if not ((bounds.low == -1).all() and (bounds.high == 1).all()):
-        # Before DoubleToFloat: on the way in, transforms apply from last to first, so this one scales in float64.
-        transforms.insert(0, ActionScaling())
-    env = TransformedEnv(base, Compose(EpisodeState(), *transforms))
-    _ = env.action_spec  # ActionScaling reads its bounds now, and its state can be loaded at any time
-    return env
+    return TransformedEnv(base, Compose(EpisodeState(), InitTracker(), RewardSum()))
 
 
 def _make_in_worker(task: Task, owner: int) -> TransformedEnv:

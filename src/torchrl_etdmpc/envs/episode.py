@@ -6,12 +6,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, Composite
 from torchrl.envs import DMControlEnv, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 __all__ = ["EpisodeState", "RecordedDMControlEnv", "load_simulator_state", "simulator_state"]
+
+
+# The name that dm_control gives to its own concatenation of a task's observations.
+_FLAT_OBSERVATION = "observations"
 
 
 class RecordedDMControlEnv(DMControlEnv):
@@ -19,10 +24,26 @@ class RecordedDMControlEnv(DMControlEnv):
 
     MuJoCo's full state is spread over the physics, the task and dm_control's own counters; but an episode follows from
     the task's random state before its reset and from the actions since, so those are kept (some tens of kilobytes).
+
+    It has one float32 ``observation`` (dm_control's ``flat_observation``, which must be on) and actions in [-1, 1] from
+    the start: transforms to these ends cost half as much as the physics.
     """
 
     _before_reset: tuple | None = None
     _actions: list[np.ndarray]
+
+    def _make_specs(self, env: Any) -> None:
+        super()._make_specs(env)
+        observation = self.observation_spec[_FLAT_OBSERVATION].to(torch.float32)
+        self.observation_spec = Composite(observation=observation, device=self.device)
+        self.reward_spec = self.reward_spec.to(torch.float32)
+        bounds = env.action_spec()
+        self._middle, self._half_width = (bounds.maximum + bounds.minimum) / 2, (bounds.maximum - bounds.minimum) / 2
+        self.action_spec = Bounded(-1, 1, shape=bounds.shape, dtype=torch.float32, device=self.device)
+
+    def read_obs(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
+        """dm_control's flat observation as a float32 tensor."""
+        return {"observation": torch.tensor(observations[_FLAT_OBSERVATION], dtype=torch.float32)}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._before_reset = self._env.task.random.get_state()
@@ -30,8 +51,23 @@ class RecordedDMControlEnv(DMControlEnv):
         return super()._reset(tensordict, **kwargs)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._actions.append(tensordict.get(self.action_key).detach().cpu().numpy().copy())
-        return super()._step(tensordict)
+        action = self._middle + self._half_width * tensordict.get(self.action_key).detach().cpu().numpy()  # float64
+        self._actions.append(action)
+        reward = 0.0
+        for _ in range(self.wrapper_frame_skip):
+            timestep = self._env.step(action)
+            reward += timestep.reward
+            if timestep.last():
+                break
+        truncated = timestep.last() and timestep.discount == 1
+        flags = {"truncated": truncated, "terminated": timestep.last() and not truncated, "done": timestep.last()}
+        return TensorDict(
+            self.read_obs(timestep.observation)
+            | {"reward": torch.tensor([reward], dtype=torch.float32)}
+            | {name: torch.tensor([flag]) for name, flag in flags.items()},
+            batch_size=self.batch_size,
+            device=self.device,
+        )
 
     def episode_state(self) -> dict[str, Tensor]:
         """Random state before the reset, the actions since, and a fingerprint of the physics that they led to."""
