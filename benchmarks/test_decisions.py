@@ -81,7 +81,7 @@ def test_decision(measure, tmp_path, name, num_envs, variant):
 def test_one_step_of_walker(measure, variant):
     """One decision without planner: dm_control alone, the TorchRL environment, and the way into the buffer."""
     env = make_dmc_env(TASK, seed=0)
-    raw = env.base_env._env
+    raw = env._env
     raw.reset()
     still = np.zeros(6)
 

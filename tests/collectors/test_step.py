@@ -383,10 +383,10 @@ def test_the_seed_phase_ends_exactly_after_its_frames_and_writes_the_planner_s_s
         init_random_frames=18,
         seed_policy=SeedPolicy(env.action_spec),
     )
-    steps, phases = [], []
+    steps, phases, stepping = [], [], iter(collector)
     while collector.frames < 26:
         phases.append(collector.in_seed_phase)
-        steps.append(collector.step())
+        steps.append(next(stepping))
     assert phases == [True] * (18 // len(lengths)) + [False] * (8 // len(lengths))
     seed, planned = torch.cat(steps)[:18], torch.cat(steps)[18:]
     assert (seed["plan", "loc"] == 0).all() and (seed["plan", "scale"] == 1).all()

@@ -171,13 +171,13 @@ def test_an_early_end_terminates_and_ends_the_action_repeat(monkeypatch):
 
     env = make_dmc_env("pendulum-swingup", seed=0)
     state = env.reset()
-    simulate, calls = env.base_env._env.step, []
+    simulate, calls = env._env.step, []
 
     def fall(action):
         calls.append(action)
         return simulate(action)._replace(step_type=StepType.LAST, discount=0.0, reward=0.25)
 
-    monkeypatch.setattr(env.base_env._env, "step", fall)
+    monkeypatch.setattr(env._env, "step", fall)
     after = env.step(state.set("action", torch.zeros(1)))["next"]
     assert len(calls) == 1
     assert after["reward"].item() == 0.25
@@ -223,7 +223,7 @@ def test_quadruped_actions_span_the_raw_bounds_and_are_stored_as_given(end):
     action = torch.full((12,), end)
     (step,) = _play(env, action.unsqueeze(0))
     assert torch.equal(step["action"], action)
-    physics = env.base_env.physics
+    physics = env.physics
     expected = {-1.0: raw.minimum, 0.0: (raw.minimum + raw.maximum) / 2, 1.0: raw.maximum}[end]
     np.testing.assert_allclose(physics.control(), expected, rtol=0, atol=1e-12)
 
@@ -243,7 +243,7 @@ def test_the_observation_joins_the_parts_in_dm_controls_order(name):
 def test_the_walkers_height_stands_between_orientations_and_velocity():
     env = make_dmc_env("walker-walk", seed=0)
     observation = env.reset()["observation"]
-    assert observation[14].item() == pytest.approx(env.base_env.physics.torso_height())
+    assert observation[14].item() == pytest.approx(env.physics.torso_height())
 
 
 @pytest.mark.slow
@@ -310,7 +310,7 @@ def test_a_process_that_cannot_render_says_so_in_one_line(backend, monkeypatch):
     def fail(**kwargs):
         raise RuntimeError("No OpenGL rendering\nbackend is available.")
 
-    monkeypatch.setattr(type(env.base_env.physics), "render", fail)
+    monkeypatch.setattr(type(env.physics), "render", fail)
     for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if backend:

@@ -75,7 +75,7 @@ def test_a_simulator_that_behaves_otherwise_is_noticed():
     carrier = first.reset()
     for _ in range(3):
         _, carrier = step(first, carrier)
-    second.base_env.physics.model.opt.gravity[2] = -5.0
+    second.physics.model.opt.gravity[2] = -5.0
     assert not load_simulator_state(second, simulator_state(first))
 
 
@@ -119,7 +119,7 @@ def test_a_collector_whose_simulator_does_not_come_back_begins_fresh_episodes_an
     ]
     for _ in range(3):
         collectors[0].step()
-    envs[1].base_env.physics.model.opt.gravity[2] = -5.0
+    envs[1].physics.model.opt.gravity[2] = -5.0
     with pytest.warns(UserWarning, match="^the simulator did not come back to where it was"):
         collectors[1].load_state_dict(collectors[0].state_dict())
     assert collectors[1].frames == 3

@@ -94,7 +94,7 @@ def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values
     torch.manual_seed(seed)
     env = make_dmc_env(config.task, seed=seed, num_envs=config.num_envs, parallel=False)
     eval_env = make_dmc_env(config.task, seed=seed)
-    eval_env.base_env._env._step_limit = 6
+    eval_env._env._step_limit = 6
     run_dir = tmp_path_factory.mktemp("run")
     log = RunLog.create(run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps)
     with warnings.catch_warnings():

@@ -20,6 +20,7 @@ from torchrl_etdmpc.training import (
     read_checkpoint,
     save_checkpoint,
 )
+from torchrl_etdmpc.training.checkpoint import FORMAT
 
 OBSERVATION_DIM, ACTION_DIM = 3, 1
 COUNTERS = {"env_steps": 100, "decision_steps": 50, "updates": 3, "wall_time_s": 1.5}
@@ -232,8 +233,8 @@ def edited(saved: tuple, path: Path, **changes: Any) -> Path:
 
 
 def test_another_format_is_refused(tmp_path, saved):
-    path = edited(saved, tmp_path / "new.pt", format=3)
-    assert refusal(path) == "has checkpoint format 3; this version reads format 2."
+    path = edited(saved, tmp_path / "new.pt", format=FORMAT + 1)
+    assert refusal(path) == f"has checkpoint format {FORMAT + 1}; this version reads format {FORMAT}."
 
 
 def test_a_checkpoint_that_lacks_entries_is_refused_with_their_names(tmp_path, saved):

@@ -64,7 +64,7 @@ def make_run(config: TrainConfig, run_dir: Path, *, resume: bool = False) -> Tra
     eval_env = make_dmc_env(config.task, seed=8 + seed, num_envs=config.eval_episodes, parallel=False)
     for base in (env, eval_env):
         for single in getattr(base, "_envs", [base]):
-            single.base_env._env._step_limit = 40  # control steps; the suite's 1000 would cost more than they show
+            single._env._step_limit = 40  # control steps; the suite's 1000 would cost more than they show
     log = (RunLog.reopen if resume else RunLog.create)(
         run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps
     )

@@ -204,7 +204,7 @@ def test_every_decision_after_the_seed_phase_is_stored_with_a_planner_s_target(f
     assert len(rows) == 80
     assert (rows["plan", "scale"][30:] != 1).all()
     assert set(rows["collector", "traj_ids"].tolist()) == {0, 1, 2, 3}
-    assert not {"plan_mean", "is_init", "episode_reward"} & set(rows.keys())
+    assert not {"plan_mean", "is_init", "episode_reward", "done"} & set(rows.keys())
 
 
 def test_two_environments_keep_the_ratio_of_updates_to_decisions(tmp_path):

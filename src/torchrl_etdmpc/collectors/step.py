@@ -141,7 +141,7 @@ class StepCollector(BaseCollector):
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yields the transitions of one step of every environment, batch size [num_envs], until ``total_frames``."""
         while self.total_frames < 0 or self._frames < self.total_frames:
-            yield self.step()
+            yield self.step().exclude(*self.exclude_keys).reshape(-1)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         return self.iterator()
@@ -153,6 +153,9 @@ class StepCollector(BaseCollector):
         Args:
             meanwhile (callable, optional): called between acting and stepping, e.g. to queue an update on a GPU that
                 runs while the simulator does; it sees the buffer without this step.
+
+        Returns:
+            The transitions, with the environment's batch size and with what is not stored.
         """
         if self._carrier is None:
             self._carrier = self._start(self._ask(self.env.reset))
@@ -167,13 +170,12 @@ class StepCollector(BaseCollector):
         stepped, carrier = self._ask(self.env.step_and_maybe_reset, tensordict)
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
-        rows = kept.reshape(-1)
-        self._check_schema(rows, seeding)
-        self._store(kept, rows)
+        self._check_schema(kept, seeding)
+        self._store(kept)
         self._frames += self.num_envs
         done = stepped.get(("next", "done")).reshape(self.num_envs)
         self._carrier = self._next_carrier(carrier, stepped, done)
-        return rows
+        return stepped
 
     def _ask(self, method: Callable[..., Any], *args: Any) -> Any:
         """Calls the environment; its exceptions end the episode and not the program."""
@@ -204,15 +206,12 @@ class StepCollector(BaseCollector):
             self._next_trajectory += 1
         return carrier.set(TRAJ_KEY, ids.reshape(carrier.batch_size))
 
-    def _store(self, kept: TensorDictBase, rows: TensorDictBase) -> None:
+    def _store(self, kept: TensorDictBase) -> None:
         if self.insertion == "step":
-            if kept.ndim:
-                index = self.replay_buffer.extend(rows.clone(False))
-            else:  # half the time of extending by one row
-                index = self.replay_buffer.add(kept.clone(False))
-            self._last_rows = index
+            # Adding one row takes half the time of extending by it.
+            self._last_rows = self.replay_buffer.extend(kept) if kept.ndim else self.replay_buffer.add(kept)
             return
-        for position, row in enumerate(rows.unbind(0)):
+        for position, row in enumerate(kept.reshape(-1).unbind(0)):
             self._pending[position].append(row.clone())
             if row.get(("next", "done")).any():
                 self.replay_buffer.extend(torch.stack(self._pending[position]))
@@ -247,10 +246,10 @@ class StepCollector(BaseCollector):
                     "the step was not stored"
                 )
 
-    def _check_schema(self, rows: TensorDictBase, seeding: bool) -> None:
+    def _check_schema(self, kept: TensorDictBase, seeding: bool) -> None:
         if seeding in self._schema:
             return
-        self._schema[seeding] = keys = set(rows.keys(True, True))
+        self._schema[seeding] = keys = set(kept.keys(True, True))
         other = self._schema.get(not seeding)
         if other is not None and other != keys:
             raise ValueError(

@@ -15,18 +15,9 @@ from functools import partial
 
 import torch
 from torch import Tensor
-from torchrl.envs import (
-    Compose,
-    DMControlEnv,
-    EnvBase,
-    InitTracker,
-    ParallelEnv,
-    RewardSum,
-    SerialEnv,
-    TransformedEnv,
-)
+from torchrl.envs import DMControlEnv, EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from torchrl_etdmpc.envs.episode import EpisodeState, RecordedDMControlEnv
+from torchrl_etdmpc.envs.episode import RecordedDMControlEnv
 from torchrl_etdmpc.envs.tasks import Task, get_task
 
 __all__ = ["make_dmc_env", "render_frame"]
@@ -103,7 +94,7 @@ def make_dmc_env(
     elif not parallel:
         env = SerialEnv(num_envs, partial(_make_one, task, "cpu"), device=device, num_threads=torch.get_num_threads())
     else:
-        # The transforms run inside the processes, side by side. Left alone, ParallelEnv would change this process' own
+        # Left alone, ParallelEnv would change this process' own
         # number of threads.
         make = partial(_make_in_worker, task, os.getpid())
         env = ParallelEnv(num_envs, make, device=device, num_threads=torch.get_num_threads())
@@ -159,9 +150,9 @@ def render_frame(env: EnvBase, height: int = 384, width: int = 384, *, camera_id
     return torch.from_numpy(frame.copy())
 
 
-def _make_one(task: Task, device: torch.device | str) -> TransformedEnv:
+def _make_one(task: Task, device: torch.device | str) -> RecordedDMControlEnv:
     with _quiet_dm_control():
-        base = RecordedDMControlEnv(
+        return RecordedDMControlEnv(
             task.domain,
             task.task,
             frame_skip=task.action_repeat,
@@ -169,10 +160,9 @@ def _make_one(task: Task, device: torch.device | str) -> TransformedEnv:
             # One array from dm_control itself is cheaper than CatTensors over up to nine entries.
             environment_kwargs={"flat_observation": True},
         )
-    return TransformedEnv(base, Compose(EpisodeState(), InitTracker(), RewardSum()))
 
 
-def _make_in_worker(task: Task, owner: int) -> TransformedEnv:
+def _make_in_worker(task: Task, owner: int) -> RecordedDMControlEnv:
     """In a worker process, leaves the ``owner`` time to finish its step and save after a signal to stop.
 
     Ctrl-C and job schedulers signal all processes of a job at once. TorchRL calls this once in the owner's process too.

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite
-from torchrl.envs import DMControlEnv, EnvBase, Transform, TransformedEnv
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import DMControlEnv, EnvBase, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-__all__ = ["EpisodeState", "RecordedDMControlEnv", "load_simulator_state", "simulator_state"]
+__all__ = ["RecordedDMControlEnv", "load_simulator_state", "simulator_state"]
 
 
 # The name that dm_control gives to its own concatenation of a task's observations.
@@ -25,17 +25,25 @@ class RecordedDMControlEnv(DMControlEnv):
     MuJoCo's full state is spread over the physics, the task and dm_control's own counters; but an episode follows from
     the task's random state before its reset and from the actions since, so those are kept (some tens of kilobytes).
 
-    It has one float32 ``observation`` (dm_control's ``flat_observation``, which must be on) and actions in [-1, 1] from
-    the start: transforms to these ends cost half as much as the physics.
+    That place is the environment's extra state, so it is in its ``state_dict`` and in that of a TorchRL environment of
+    several copies.
+
+    From the start it has one float32 ``observation`` (dm_control's ``flat_observation``, which must be on), actions in
+    [-1, 1], ``is_init`` and ``episode_reward``: transforms to these ends cost more time than the physics.
     """
 
     _before_reset: tuple | None = None
     _actions: list[np.ndarray]
+    _episode_reward: Tensor
 
     def _make_specs(self, env: Any) -> None:
         super()._make_specs(env)
-        observation = self.observation_spec[_FLAT_OBSERVATION].to(torch.float32)
-        self.observation_spec = Composite(observation=observation, device=self.device)
+        self.observation_spec = Composite(
+            observation=self.observation_spec[_FLAT_OBSERVATION].to(torch.float32),
+            is_init=Binary(1, dtype=torch.bool),
+            episode_reward=Unbounded(1),
+            device=self.device,
+        )
         self.reward_spec = self.reward_spec.to(torch.float32)
         bounds = env.action_spec()
         self._middle, self._half_width = (bounds.maximum + bounds.minimum) / 2, (bounds.maximum - bounds.minimum) / 2
@@ -48,28 +56,42 @@ class RecordedDMControlEnv(DMControlEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._before_reset = self._env.task.random.get_state()
         self._actions = []
-        return super()._reset(tensordict, **kwargs)
+        self._episode_reward = torch.zeros(1)
+        first = super()._reset(tensordict, **kwargs)
+        return first.update({"is_init": torch.ones(1, dtype=torch.bool), "episode_reward": self._episode_reward})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._middle + self._half_width * tensordict.get(self.action_key).detach().cpu().numpy()  # float64
-        self._actions.append(action)
-        reward = 0.0
-        for _ in range(self.wrapper_frame_skip):
-            timestep = self._env.step(action)
-            reward += timestep.reward
-            if timestep.last():
-                break
+        timestep, reward = self._decide(action)
         truncated = timestep.last() and timestep.discount == 1
-        flags = {"truncated": truncated, "terminated": timestep.last() and not truncated, "done": timestep.last()}
+        flags = {
+            "is_init": False,
+            "truncated": truncated,
+            "terminated": timestep.last() and not truncated,
+            "done": timestep.last(),
+        }
         return TensorDict(
             self.read_obs(timestep.observation)
-            | {"reward": torch.tensor([reward], dtype=torch.float32)}
+            | {"reward": reward, "episode_reward": self._episode_reward}
             | {name: torch.tensor([flag]) for name, flag in flags.items()},
             batch_size=self.batch_size,
             device=self.device,
         )
 
-    def episode_state(self) -> dict[str, Tensor]:
+    def _decide(self, action: np.ndarray) -> tuple[Any, Tensor]:
+        """The last time step of an action that is repeated, and the sum of the rewards on the way."""
+        self._actions.append(action)
+        total = 0.0
+        for _ in range(self.wrapper_frame_skip):
+            timestep = self._env.step(action)
+            total += timestep.reward
+            if timestep.last():
+                break
+        reward = torch.tensor([total], dtype=torch.float32)
+        self._episode_reward = self._episode_reward + reward
+        return timestep, reward
+
+    def get_extra_state(self) -> dict[str, Tensor]:
         """Random state before the reset, the actions since, and a fingerprint of the physics that they led to."""
         if self._before_reset is None:
             return {}
@@ -79,42 +101,17 @@ class RecordedDMControlEnv(DMControlEnv):
             "physics": torch.from_numpy(self.physics.get_state().copy()),
         }
 
-    def restore_episode(self, state: dict[str, Tensor]) -> None:
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Goes through the episode again.
 
-        Afterwards :meth:`episode_state` equals ``state`` if the simulator is as deterministic here as it was there.
+        Afterwards :meth:`get_extra_state` equals ``state`` if the simulator is as deterministic here as it was there.
         """
         if not state:
             return
         self._env.task.random.set_state(_unpack(state["random"]))
         self._reset()
         for action in state["actions"].numpy():
-            self._actions.append(action.copy())
-            for _ in range(self.wrapper_frame_skip):
-                if self._env.step(action).last():
-                    break
-
-
-class EpisodeState(Transform):
-    """Carries a :class:`RecordedDMControlEnv`'s episode in the ``state_dict`` of the environment around it.
-
-    TorchRL's batched environments pass state dicts to and from their workers, and the state dict of a transformed
-    environment is that of its transforms.
-    """
-
-    def get_extra_state(self) -> dict[str, Tensor]:
-        """See :meth:`RecordedDMControlEnv.episode_state`."""
-        return self._base().episode_state()
-
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """See :meth:`RecordedDMControlEnv.restore_episode`."""
-        self._base().restore_episode(state)
-
-    def _base(self) -> RecordedDMControlEnv:
-        env = self.parent
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
-        return env
+            self._decide(action.copy())
 
 
 def simulator_state(env: EnvBase) -> dict[str, Any] | None:
@@ -128,8 +125,7 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
     """
     state = _simulator(env).state_dict()
     workers = list(state.values()) if isinstance(_simulator(env), BatchedEnvBase) else [state]
-    episodes = [[value for key, value in worker.items() if key.endswith("_extra_state")] for worker in workers]
-    return dict(state) if all(episodes) else None
+    return dict(state) if all("_extra_state" in worker for worker in workers) else None
 
 
 def load_simulator_state(env: EnvBase, state: dict[str, Any]) -> bool:
@@ -145,8 +141,8 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any]) -> bool:
 
 
 def _simulator(env: EnvBase) -> EnvBase:
-    """The batched environment, or the innermost environment with transforms."""
-    while isinstance(env, TransformedEnv) and isinstance(env.base_env, TransformedEnv | BatchedEnvBase):
+    """The environment below all transforms."""
+    while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
 

@@ -206,12 +206,12 @@ class TrainingRun:
             bool: whether it was made. A simulator that fails costs its episode, and counts.
         """
         try:
-            rows = self.collector.step(meanwhile)
+            stepped = self.collector.step(meanwhile)
         except (NonFiniteError, SimulatorError) as error:
             self._count_fault(error)
             return False
-        done = rows["next", "done"]
-        self.episode_returns.extend(rows["next", "episode_reward"][done].tolist())
+        done = stepped["next", "done"]
+        self.episode_returns.extend(stepped["next", "episode_reward"][done].tolist())
         if done.any():
             self.faults_in_a_row = 0
         return True
