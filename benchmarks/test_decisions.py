@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 import torch
 from sized import DEVICE, VARIANTS, configure
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_etdmpc import StepCollector
 from torchrl_etdmpc.collectors import SeedPolicy
 from torchrl_etdmpc.envs import make_dmc_env
-from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun
+from torchrl_etdmpc.training import (
+    RunLog,
+    TrainConfig,
+    TrainingRun,
+    build_agent,
+    build_collector,
+    build_replay,
+)
 
 TASK = "walker-walk"
 # What a CPU can do in minutes; a GPU runs them all.
@@ -77,9 +82,13 @@ def test_decision(measure, tmp_path, name, num_envs, variant):
         run.eval_env.close()
 
 
-@pytest.mark.parametrize("variant", ["simulator", "environment", "environment and collector"])
+@pytest.mark.parametrize("variant", ["simulator", "random policy", "environment", "environment and collector"])
 def test_one_step_of_walker(measure, variant):
-    """One decision without planner: dm_control alone, the TorchRL environment, and the way into the buffer."""
+    """One decision without planner: dm_control alone, the TorchRL environment, and the way into the run's buffer.
+
+    The last holds the random policy of the seed phase, which is measured apart too.
+    """
+    config = configure("cpu", "eager", task=TASK, num_envs=1, eval_episodes=1, total_env_steps=100_000)
     env = make_dmc_env(TASK, seed=0)
     raw = env._env
     raw.reset()
@@ -91,15 +100,21 @@ def test_one_step_of_walker(measure, variant):
             raw.reset()
 
     state = {"now": env.reset()}
+    policy = SeedPolicy(env.action_spec)
+
+    def act() -> None:
+        policy(state["now"])
 
     def step() -> None:
         now = state["now"].set("action", torch.zeros(6))
         _, state["now"] = env.step_and_maybe_reset(now)
 
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000))
-    collector = StepCollector(env, SeedPolicy(env.action_spec), replay_buffer=buffer)
-    call = {"simulator": simulate, "environment": step, "environment and collector": collector.step}[variant]
+    buffer = build_replay(config)
+    collector = build_collector(config, build_agent(config, 24, 6), env, buffer)
+    calls = {"simulator": simulate, "random policy": act, "environment": step}
+    call = calls.get(variant, collector.step)
     call()
     assert variant != "environment and collector" or len(buffer) == 1
     measure("one step of walker", variant, call, rounds=400, warmup_rounds=50, baseline="simulator")
+    assert collector.in_seed_phase
     env.close()

@@ -173,8 +173,7 @@ class StepCollector(BaseCollector):
         self._check_schema(kept, seeding)
         self._store(kept)
         self._frames += self.num_envs
-        done = stepped.get(("next", "done")).reshape(self.num_envs)
-        self._carrier = self._next_carrier(carrier, stepped, done)
+        self._carrier = self._next_carrier(carrier, stepped)
         return stepped
 
     def _ask(self, method: Callable[..., Any], *args: Any) -> Any:
@@ -199,12 +198,14 @@ class StepCollector(BaseCollector):
         self._next_trajectory += self.num_envs
         return tensordict.set(TRAJ_KEY, ids.reshape(tensordict.batch_size))
 
-    def _next_carrier(self, carrier: TensorDictBase, stepped: TensorDictBase, done: torch.Tensor) -> TensorDictBase:
-        ids = stepped.get(TRAJ_KEY).reshape(self.num_envs).clone()
-        for position in done.nonzero().flatten().tolist():
-            ids[position] = self._next_trajectory
-            self._next_trajectory += 1
-        return carrier.set(TRAJ_KEY, ids.reshape(carrier.batch_size))
+    def _next_carrier(self, carrier: TensorDictBase, stepped: TensorDictBase) -> TensorDictBase:
+        ids, done = stepped.get(TRAJ_KEY), stepped.get(("next", "done"))
+        if done.any():
+            ids = ids.clone()
+            for position in done.reshape(self.num_envs).nonzero().flatten().tolist():
+                ids.view(-1)[position] = self._next_trajectory
+                self._next_trajectory += 1
+        return carrier.set(TRAJ_KEY, ids)
 
     def _store(self, kept: TensorDictBase) -> None:
         if self.insertion == "step":
