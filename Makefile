@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 RUN_DIR ?= runs/walker-stand
+JOBS ?= 2
 ARGS ?=
 
 VENV := .venv
@@ -12,7 +13,7 @@ READY := $(VENV)/.ready
 
 help:
 	@echo "make train   train on walker-stand on a CPU (RUN_DIR=runs/walker-stand, ARGS=\"more options\")"
-	@echo "make test    run the tests and the examples in docstrings (ARGS=\"pytest options\")"
+	@echo "make test    run the tests and the examples in docstrings, JOBS=2 files at a time (ARGS=\"pytest options\")"
 	@echo "make lint    check the code with ruff"
 	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
 	@echo "make clean   remove .venv, caches and build output; runs/ stays"
@@ -22,8 +23,9 @@ train: $(READY)
 	@$(VENV)/bin/python examples/train_dmc.py task=walker-stand preset=cpu seed=1 total_env_steps=25000 eval_every=5000 run_dir=$(RUN_DIR) $(ARGS)
 
 test: export MUJOCO_GL ?= disable
+test: export OMP_NUM_THREADS ?= 1
 test: $(READY)
-	@$(VENV)/bin/python -m pytest $(ARGS)
+	@$(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile $(ARGS)
 
 lint: $(READY)
 	@$(VENV)/bin/ruff check

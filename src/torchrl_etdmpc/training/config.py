@@ -79,7 +79,7 @@ class PlannerConfig:
     first_action: str = "elite"
     eval_first_action: str = "best"
     scoring_dtype: str = "float32"
-    """``bfloat16`` rolls and scores candidates in half precision; its effect on learning is not measured."""
+    """``bfloat16`` rolls and scores candidates in half precision; learning with it is measured on walker-stand only."""
 
     def __post_init__(self) -> None:
         group = "reanalyze" if isinstance(self, ReanalyzeConfig) else "planner"
