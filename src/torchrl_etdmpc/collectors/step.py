@@ -120,6 +120,7 @@ class StepCollector(BaseCollector):
         self._frames = 0
         self._next_trajectory = 0
         self._carrier: TensorDictBase | None = None
+        self._after_reset = False
         self._last_rows: int | torch.Tensor | None = None
         self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
         self._schema: dict[bool, set] = {}
@@ -159,7 +160,9 @@ class StepCollector(BaseCollector):
         """
         if self._carrier is None:
             self._carrier = self._start(self._ask(self.env.reset))
-        self._check_finite(self._carrier, self._checked_before, "the environment")  # a reset's are new here
+            self._after_reset = True
+        if self._after_reset:
+            self._check_finite(self._carrier, self._checked_before, "the environment")
         seeding = self.in_seed_phase
         with set_exploration_type(self.exploration_type):
             tensordict = self._act(self._carrier, seeding)
@@ -200,7 +203,8 @@ class StepCollector(BaseCollector):
 
     def _next_carrier(self, carrier: TensorDictBase, stepped: TensorDictBase) -> TensorDictBase:
         ids, done = stepped.get(TRAJ_KEY), stepped.get(("next", "done"))
-        if done.any():
+        self._after_reset = bool(done.any())
+        if self._after_reset:
             ids = ids.clone()
             for position in done.reshape(self.num_envs).nonzero().flatten().tolist():
                 ids.view(-1)[position] = self._next_trajectory
@@ -309,6 +313,7 @@ class StepCollector(BaseCollector):
             return
         batch_size, device = self.env.batch_size, self.env.device
         self._carrier = TensorDict(state_dict["carrier"], batch_size, device=device)
+        self._after_reset = True  # perhaps
         self._pending = [[TensorDict(row, [], device=device) for row in rows] for rows in state_dict["pending"]]
 
     def __repr__(self) -> str:

@@ -51,7 +51,7 @@ class RecordedDMControlEnv(DMControlEnv):
 
     def read_obs(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
         """dm_control's flat observation as a float32 tensor."""
-        return {"observation": torch.tensor(observations[_FLAT_OBSERVATION], dtype=torch.float32)}
+        return {"observation": torch.from_numpy(observations[_FLAT_OBSERVATION].astype(np.float32))}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._before_reset = self._env.task.random.get_state()
@@ -61,7 +61,7 @@ class RecordedDMControlEnv(DMControlEnv):
         return first.update({"is_init": torch.ones(1, dtype=torch.bool), "episode_reward": self._episode_reward})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._middle + self._half_width * tensordict.get(self.action_key).detach().cpu().numpy()  # float64
+        action = self._middle + self._half_width * tensordict.get(self.action_key).numpy(force=True)  # float64
         timestep, reward = self._decide(action)
         truncated = timestep.last() and timestep.discount == 1
         flags = {
@@ -73,7 +73,7 @@ class RecordedDMControlEnv(DMControlEnv):
         return TensorDict(
             self.read_obs(timestep.observation)
             | {"reward": reward, "episode_reward": self._episode_reward}
-            | {name: torch.tensor([flag]) for name, flag in flags.items()},
+            | {name: torch.full((1,), bool(flag)) for name, flag in flags.items()},
             batch_size=self.batch_size,
             device=self.device,
         )
