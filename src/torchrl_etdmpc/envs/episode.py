@@ -29,7 +29,7 @@ class RecordedDMControlEnv(DMControlEnv):
     several copies.
 
     From the start it has one float32 ``observation`` (dm_control's ``flat_observation``, which must be on), actions in
-    [-1, 1], ``is_init`` and ``episode_reward``: transforms to these ends cost more time than the physics.
+    [-1, 1], ``is_init`` and ``episode_reward``: transforms to these ends cost as much time as the physics.
     """
 
     _before_reset: tuple | None = None
