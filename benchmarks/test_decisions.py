@@ -10,14 +10,7 @@ from sized import DEVICE, VARIANTS, configure
 
 from torchrl_etdmpc.collectors import SeedPolicy
 from torchrl_etdmpc.envs import make_dmc_env
-from torchrl_etdmpc.training import (
-    RunLog,
-    TrainConfig,
-    TrainingRun,
-    build_agent,
-    build_collector,
-    build_replay,
-)
+from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, build_agent, build_collector, build_replay
 
 TASK = "walker-walk"
 # What a CPU can do in minutes; a GPU runs them all.

@@ -27,6 +27,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     TrainConfig,
     TrainingRun,
     build_replay,
+    load_agent,
     read_run_config,
     resumed_config,
 )
@@ -251,6 +252,19 @@ def test_without_any_checkpoint_the_error_says_so(tmp_path):
     RunLog.create(tmp_path, config=config.to_dict(), total_env_steps=140).close()
     with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\.$"):
         make_run(config, tmp_path, resume=True)
+
+
+def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(tmp_path):
+    config = tiny_config()
+    make_run(config, tmp_path).run()
+    for file in tmp_path.glob("checkpoints/resume/*/manifest.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 1}))
+    with pytest.raises(
+        CheckpointError, match=r"^cannot resume: .*/000000000140 has checkpoint format 1; this version r"
+    ):
+        make_run(config, tmp_path, resume=True)
+    _, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
+    assert counters["env_steps"] == 140
 
 
 @pytest.fixture

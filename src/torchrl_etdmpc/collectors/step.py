@@ -156,7 +156,7 @@ class StepCollector(BaseCollector):
                 runs while the simulator does; it sees the buffer without this step.
 
         Returns:
-            The transitions, with the environment's batch size and with what is not stored.
+            The transitions, batch size of the environment; what is not stored is in them too.
         """
         if self._carrier is None:
             self._carrier = self._start(self._ask(self.env.reset))
@@ -313,7 +313,7 @@ class StepCollector(BaseCollector):
             return
         batch_size, device = self.env.batch_size, self.env.device
         self._carrier = TensorDict(state_dict["carrier"], batch_size, device=device)
-        self._after_reset = True  # perhaps
+        self._after_reset = True  # if it is not, nothing is lost by looking twice
         self._pending = [[TensorDict(row, [], device=device) for row in rows] for rows in state_dict["pending"]]
 
     def __repr__(self) -> str:

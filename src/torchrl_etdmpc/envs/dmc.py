@@ -94,8 +94,7 @@ def make_dmc_env(
     elif not parallel:
         env = SerialEnv(num_envs, partial(_make_one, task, "cpu"), device=device, num_threads=torch.get_num_threads())
     else:
-        # Left alone, ParallelEnv would change this process' own
-        # number of threads.
+        # Left alone, ParallelEnv would change this process' own number of threads.
         make = partial(_make_in_worker, task, os.getpid())
         env = ParallelEnv(num_envs, make, device=device, num_threads=torch.get_num_threads())
     if seed is not None:

@@ -12,7 +12,7 @@ from torchrl_etdmpc.training.atomic_file import replacing
 from torchrl_etdmpc.training.builders import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
-FORMAT = 3
+FORMAT = 2
 _ENTRIES = {"config", "observation_dim", "action_dim", "world_model", "loss", "updater", "counters"}
 
 

@@ -29,7 +29,7 @@ from torchrl_etdmpc.training.checkpoint import CheckpointError, load_state, read
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.versions import library_versions
 
-FORMAT = 1
+FORMAT = 2
 
 
 class Restored(NamedTuple):
