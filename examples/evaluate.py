@@ -16,15 +16,16 @@ os.environ.setdefault("MUJOCO_GL", "egl" if filming else "disable")
 
 import torch  # noqa: E402
 
-from torchrl_etdmpc.envs import get_task, make_dmc_env, render_frame  # noqa: E402
+from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame  # noqa: E402
+from torchrl_etdmpc.runs import write_mp4  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     BarePolicy,
+    TrainConfig,
     evaluate,
     hydra_main,
     load_agent,
-    read_checkpoint,
+    read_agent_file,
     resolve_device,
-    write_mp4,
 )
 
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks
@@ -51,13 +52,21 @@ class EvaluateConfig:
             raise ValueError(f"video must end in .mp4, got {self.video!r}.")
 
 
+def task_of(config: EvaluateConfig) -> Task:
+    """The task that the command names, or the one that the agent was trained on, with what its run changed about it."""
+    stored = read_agent_file(config.checkpoint)["config"]
+    if config.task is not None and config.task != stored["task"]:
+        return get_task(config.task)
+    return TrainConfig.from_dict(stored).task_spec
+
+
 @hydra_main(str(Path(__file__).resolve().parent / "config"), "evaluate", EvaluateConfig)
 def main(config: EvaluateConfig) -> None:
     """Loads, runs the episodes, prints the returns."""
     device = resolve_device(config.device)
-    task = get_task(config.task or read_checkpoint(config.checkpoint)["config"]["task"])
+    task = task_of(config)
     # A film needs the one environment that it shows; otherwise the episodes run side by side.
-    env = make_dmc_env(task, seed=config.seed, num_envs=1 if config.video else config.episodes, parallel=False)
+    env = make_env(task, seed=config.seed, num_envs=1 if config.video else config.episodes, parallel=False)
     agent, _, counters = load_agent(
         config.checkpoint,
         observation_dim=env.observation_spec["observation"].shape[-1],

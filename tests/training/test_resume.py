@@ -7,7 +7,8 @@ import random
 import signal
 import subprocess
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,10 @@ from torch.utils._pytree import tree_map_only
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore  # noqa: E402
+from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
-    CheckpointError,
-    CheckpointStore,
     RunInterrupted,
-    RunLog,
     TrainConfig,
     TrainingRun,
     build_replay,
@@ -33,43 +32,25 @@ from torchrl_etdmpc.training import (  # noqa: E402
 )
 
 
-def tiny_config(**changes: Any) -> TrainConfig:
-    values: dict[str, Any] = {
-        "task": "cartpole-swingup",
-        "preset": "cpu",
-        "total_env_steps": 140,
-        "compile": "off",
-        "eval_every": 60,
-        "eval_episodes": 2,
-        "checkpoint_every": 50,
-        "log_every": 20,
-        "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
-        "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
-        "reanalyze": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 1},
-        "optim": {"batch_size": 4, "updates_per_decision": 2},
-        "replay": {"seed_decisions": 24, "pretrain_updates": 7},
-    }
-    values["reanalyze"] |= {"every": 3, "num_slices": 2}
-    for name, change in changes.items():
-        values[name] = {**values.get(name, {}), **change} if isinstance(change, dict) else change
-    return TrainConfig.from_dict(values)
+SETTINGS: dict[str, Any] = {
+    "task": "cartpole-swingup",
+    "total_env_steps": 140,
+    "eval_every": 60,
+    "eval_episodes": 2,
+    "checkpoint_every": 50,
+    "log_every": 20,
+    "replay": {"seed_decisions": 24},
+}
 
 
-def make_run(config: TrainConfig, run_dir: Path, *, resume: bool = False) -> TrainingRun:
-    """As a new process would: the random numbers are somewhere else until they are restored."""
-    seed = 99 if resume else 0
-    torch.manual_seed(seed)
-    np.random.seed(seed)
-    random.seed(seed)
-    env = make_dmc_env(config.task, seed=7 + seed, num_envs=config.num_envs, parallel=False)
-    eval_env = make_dmc_env(config.task, seed=8 + seed, num_envs=config.eval_episodes, parallel=False)
-    for base in (env, eval_env):
-        for single in getattr(base, "_envs", [base]):
-            single._env._step_limit = 40  # control steps; the suite's 1000 would cost more than they show
-    log = (RunLog.reopen if resume else RunLog.create)(
-        run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps
-    )
-    return TrainingRun(config, env=env, eval_env=eval_env, log=log, resume=resume)
+@pytest.fixture
+def small_config(tiny_config) -> Callable[..., TrainConfig]:
+    """Three episodes and a half; checkpoints, rows and evaluations at different steps."""
+
+    def make(**changes: Any) -> TrainConfig:
+        return tiny_config(**SETTINGS | changes | {"replay": SETTINGS["replay"] | changes.get("replay", {})})
+
+    return make
 
 
 def results(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
@@ -79,16 +60,16 @@ def results(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
         with (run_dir / name).open(newline="") as file:
             return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in csv.DictReader(file)]
 
-    stored = run.replay.storage[:]
+    stored = run.learner.replay.storage[:]
     summary = json.loads((run_dir / "summary.json").read_text())
     return {
         "train.csv": rows("train.csv"),
         "eval.csv": rows("eval.csv"),
         "summary": {key: summary[key] for key in ("env_steps", "final_return", "best_return")},
-        "weights": {name: value.tolist() for name, value in run.agent.loss.state_dict().items()},
-        "updater": tree_map_only(torch.Tensor, torch.Tensor.tolist, run.agent.updater.state_dict()),
+        "weights": {name: value.tolist() for name, value in run.learner.agent.loss.state_dict().items()},
+        "updater": tree_map_only(torch.Tensor, torch.Tensor.tolist, run.learner.agent.updater.state_dict()),
         "replay": {str(key): stored.get(key).tolist() for key in stored.keys(True, True)},
-        "generations": run.replay.writer.generations_of(torch.arange(len(run.replay))).tolist(),
+        "generations": run.learner.replay.writer.generations_of(torch.arange(len(run.learner.replay))).tolist(),
         "random": torch.rand(3).tolist(),
     }
 
@@ -100,14 +81,14 @@ def stop_at(run: TrainingRun, owner: Any, method: str, call: int) -> None:
     def watched(*args: Any, **kwargs: Any) -> Any:
         calls[0] += 1
         if calls[0] == call:
-            run._stop.requested = True
+            run.stop.requested = True
         return original(*args, **kwargs)
 
     setattr(owner, method, watched)
 
 
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory) -> Callable[[TrainConfig], dict[str, Any]]:
+def straight(tmp_path_factory, make_run) -> Callable[[TrainConfig], dict[str, Any]]:
     """The results of a run without interruptions, one per configuration."""
     known: dict[str, dict[str, Any]] = {}
 
@@ -124,26 +105,26 @@ def straight(tmp_path_factory) -> Callable[[TrainConfig], dict[str, Any]]:
 
 
 PLACES = {
-    "in the first evaluation": (lambda run: (run.eval_env, "step_and_maybe_reset"), 5),
-    "in the seed phase": (lambda run: (run.collector, "step"), 13),
-    "in pretraining": (lambda run: (run.agent.updater, "step"), 4),
-    "in an update": (lambda run: (run.agent.updater, "step"), 20),
-    "in a decision in mid-episode": (lambda run: (run.collector, "step"), 33),
-    "at the end of an episode": (lambda run: (run.collector, "step"), 40),
-    "in a later evaluation": (lambda run: (run.eval_env, "step_and_maybe_reset"), 30),
+    "in the first evaluation": (lambda run: (run.evaluator.env, "step_and_maybe_reset"), 5),
+    "in the seed phase": (lambda run: (run.learner.collector, "act"), 13),
+    "in pretraining": (lambda run: (run.learner.agent.updater, "step"), 4),
+    "in an update": (lambda run: (run.learner.agent.updater, "step"), 20),
+    "in a decision in mid-episode": (lambda run: (run.learner.collector, "act"), 33),
+    "at the end of an episode": (lambda run: (run.learner.collector, "act"), 40),
+    "in a later evaluation": (lambda run: (run.evaluator.env, "step_and_maybe_reset"), 30),
     "while it is saved": (lambda run: (run.store, "save"), 1),
 }
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, straight, place):
-    config = tiny_config()
+def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, straight, place, small_config, make_run):
+    config = small_config()
     run = make_run(config, tmp_path)
     find, call = PLACES[place]
     stop_at(run, *find(run), call)
     with pytest.raises(RunInterrupted, match=r"^stopped at \d+ env steps and saved in .*; go on with resume=true\.$"):
         run.run()
-    run.log.close()
+    run.log.directory.close()
     resumed = make_run(config, tmp_path, resume=True)
     resumed.run()
     assert results(resumed, tmp_path) == straight(config)
@@ -160,21 +141,21 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, st
         {"planner": {"first_action": "mean"}, "eval_policy": True},
     ],
 )
-def test_every_kind_of_run_can_be_stopped_many_times(tmp_path, straight, changes):
-    config = tiny_config(**changes)
+def test_every_kind_of_run_can_be_stopped_many_times(tmp_path, straight, changes, small_config, make_run):
+    config = small_config(**changes)
     run = make_run(config, tmp_path)
     for call in (9, 4, 3, 7, 1):
-        stop_at(run, run.collector, "step", call)
+        stop_at(run, run.learner.collector, "act", call)
         with pytest.raises(RunInterrupted):
             run.run()
-        run.log.close()
+        run.log.directory.close()
         run = make_run(config, tmp_path, resume=True)
     run.run()
     assert results(run, tmp_path) == straight(config)
 
 
-def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(tmp_path, straight):
-    config = tiny_config()
+def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(tmp_path, straight, small_config, make_run):
+    config = small_config()
 
     class Killed(BaseException):
         pass
@@ -183,13 +164,13 @@ def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(tmp_path, 
         raise Killed
 
     run = make_run(config, tmp_path)
-    original = run.collector.step
+    original = run.learner.collector.act
     calls = iter([original] * 62 + [lambda *_: die()])
-    run.collector.step = lambda *args: next(calls)(*args)
+    run.learner.collector.act = lambda *args: next(calls)(*args)
     with pytest.raises(Killed):
         run.run()
     assert len((tmp_path / "eval.csv").read_text().splitlines()) == 4  # a row that the checkpoint has not seen
-    run.log.close()
+    run.log.directory.close()
     with (tmp_path / "train.csv").open("a") as file:
         file.write("12,3,half a ro")
     resumed = make_run(config, tmp_path, resume=True)
@@ -198,30 +179,30 @@ def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(tmp_path, 
     assert results(resumed, tmp_path) == straight(config)
 
 
-def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path):
-    short = tiny_config(total_env_steps=100)
+def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path, small_config, make_run):
+    short = small_config(total_env_steps=100)
     run = make_run(short, tmp_path)
     run.run()
-    longer = resumed_config(read_run_config(tmp_path), tiny_config(total_env_steps=140), ["total_env_steps"])
+    longer = resumed_config(read_run_config(RunDirectory(tmp_path)), small_config(total_env_steps=140), ["total_env_steps"])
     resumed = make_run(longer, tmp_path, resume=True)
     assert resumed.run()["env_steps"] == 140
-    assert read_run_config(tmp_path).total_env_steps == 140
-    assert len(resumed.replay) == 70
+    assert read_run_config(RunDirectory(tmp_path)).total_env_steps == 140
+    assert len(resumed.learner.replay) == 70
 
 
-def test_other_settings_must_stay(tmp_path):
-    saved = tiny_config()
-    asked = tiny_config(planner={"horizon": 3}, threads=2)
+def test_other_settings_must_stay(tmp_path, small_config):
+    saved = small_config()
+    asked = small_config(planner={"horizon": 3}, threads=2)
     assert resumed_config(saved, asked, ["threads"]).threads == 2
     assert resumed_config(saved, asked, []).planner.horizon == 2
     with pytest.raises(ValueError, match=r"^planner.horizon=3 was asked for, but this run was started with "):
         resumed_config(saved, asked, ["planner.horizon"])
 
 
-@pytest.mark.parametrize("damaged", ["agent.pt", "run.pt", "manifest.json", "replay"])
+@pytest.mark.parametrize("damaged", ["agent.pt", "collector.pt", "state.pt", "manifest.json", "replay"])
 @pytest.mark.parametrize("how", ["missing", "cut off", "a flipped bit"])
-def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(tmp_path, straight, damaged, how):
-    config = tiny_config()
+def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(tmp_path, straight, damaged, how, small_config, make_run):
+    config = small_config()
     make_run(config, tmp_path).run()
     checkpoints = tmp_path / "checkpoints"
     newest = checkpoints / "resume" / f"{140:012d}"
@@ -247,15 +228,17 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(tmp_path, straig
     assert results(resumed, tmp_path) == straight(config)
 
 
-def test_without_any_checkpoint_the_error_says_so(tmp_path):
-    config = tiny_config()
-    RunLog.create(tmp_path, config=config.to_dict(), total_env_steps=140).close()
+def test_without_any_checkpoint_the_error_says_so(tmp_path, small_config, make_run):
+    config = small_config()
+    directory = RunDirectory(tmp_path)
+    directory.begin(config.to_dict())
+    directory.close()
     with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\.$"):
         make_run(config, tmp_path, resume=True)
 
 
-def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(tmp_path):
-    config = tiny_config()
+def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(tmp_path, small_config, make_run):
+    config = small_config()
     make_run(config, tmp_path).run()
     for file in tmp_path.glob("checkpoints/resume/*/manifest.json"):
         file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 1}))
@@ -265,22 +248,6 @@ def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(tm
         make_run(config, tmp_path, resume=True)
     _, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
     assert counters["env_steps"] == 140
-
-
-@pytest.fixture
-def small_disk(tmp_path) -> Iterator[Path]:
-    """A file system of 20 MB."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=20m", "tmpfs", str(disk)]
-    try:
-        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
-    except FileNotFoundError:
-        mounted = False
-    if not mounted:
-        pytest.skip("mounting needs root")
-    yield disk
-    subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
 def fill(disk: Path) -> None:
@@ -293,11 +260,11 @@ def fill(disk: Path) -> None:
                 continue
 
 
-def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight):
-    config = tiny_config(checkpoint_every=30)
+def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight, small_config, make_run):
+    config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    step, calls = run.collector.step, [0]
+    step, calls = run.learner.collector.act, [0]
 
     def watched(*args: Any) -> Any:
         calls[0] += 1
@@ -307,7 +274,7 @@ def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight):
             (small_disk / "ballast").unlink()
         return step(*args)
 
-    run.collector.step = watched
+    run.learner.collector.act = watched
     with pytest.warns(UserWarning) as warned:
         run.run()
     texts = [str(warning.message) for warning in warned]
@@ -318,11 +285,11 @@ def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight):
     assert make_run(config, run_dir, resume=True).env_steps == 140
 
 
-def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_disk, straight):
-    config = tiny_config(checkpoint_every=30)
+def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_disk, straight, small_config, make_run):
+    config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    step, calls = run.collector.step, [0]
+    step, calls = run.learner.collector.act, [0]
 
     class Killed(BaseException):
         pass
@@ -335,10 +302,10 @@ def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_d
             raise Killed
         return step(*args)
 
-    run.collector.step = watched
+    run.learner.collector.act = watched
     with pytest.warns(UserWarning, match="no checkpoint at 90 env steps"), pytest.raises(Killed):
         run.run()
-    run.log.close()
+    run.log.directory.close()
     (small_disk / "ballast").unlink()
     resumed = make_run(config, run_dir, resume=True)
     assert resumed.env_steps == 60
@@ -346,27 +313,27 @@ def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_d
     assert results(resumed, run_dir) == straight(config)
 
 
-def test_best_and_last_follow_the_first_checkpoint_that_a_full_disk_lets_through(small_disk):
-    run = make_run(tiny_config(), small_disk / "run")
+def test_best_and_last_follow_the_first_checkpoint_that_a_full_disk_lets_through(small_disk, small_config, make_run):
+    run = make_run(small_config(), small_disk / "run")
     for _ in range(30):
-        run.step()
-    run.eval_returns = [1.0]
+        run.learner.step()
+    run.state.eval_returns = [1.0]
     assert run.save()
-    run.eval_returns = [1.0, 2.0]
+    run.state.eval_returns = [1.0, 2.0]
     fill(small_disk)
     with pytest.warns(UserWarning, match="no checkpoint at 60 env steps"):
         assert not run.save()
     best = small_disk / "run" / "checkpoints" / "best.pt"
     before = best.stat().st_ino
     (small_disk / "ballast").unlink()
-    run.eval_returns = [1.0, 2.0, 2.0]
+    run.state.eval_returns = [1.0, 2.0, 2.0]
     assert run.save()
     assert best.stat().st_ino != before
 
 
-def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(small_disk):
-    run = make_run(tiny_config(), small_disk / "run")
-    stop_at(run, run.collector, "step", 30)
+def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(small_disk, small_config, make_run):
+    run = make_run(small_config(), small_disk / "run")
+    stop_at(run, run.learner.collector, "act", 30)
     fill(small_disk)
     expected = r"^stopped at \d+ env steps and not saved: the checkpoint before it stays in "
     with pytest.warns(UserWarning) as warned, pytest.raises(RunInterrupted, match=expected):
@@ -374,14 +341,14 @@ def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(sm
     assert "no checkpoint at 60 env steps (No space left on device)" in str(warned[-1].message)
 
 
-def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written(small_disk, straight):
-    config = tiny_config()
+def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written(small_disk, straight, small_config, make_run):
+    config = small_config()
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    stop_at(run, run.collector, "step", 40)
+    stop_at(run, run.learner.collector, "act", 40)
     with pytest.raises(RunInterrupted):
         run.run()
-    run.log.close()
+    run.log.directory.close()
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     for begin in (lambda: make_run(config, run_dir, resume=True), lambda: make_run(config, small_disk / "new")):
         with pytest.raises(
@@ -394,21 +361,23 @@ def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written
     assert results(resumed, run_dir) == straight(config)
 
 
-def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_that_works(tmp_path):
-    config = tiny_config()
+def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_that_works(tmp_path, small_config, make_run):
+    config = small_config()
     run = make_run(config, tmp_path)
     for _ in range(30):
-        run.step()
+        run.learner.step()
     run.save()
     for _ in range(10):
-        run.step()
+        run.learner.step()
     outcomes = []
-    for moment in range(1, 18):
+    for moment in count(1):
         killed = killed_while_saving(run, moment)
         resumed = make_run(config, tmp_path, resume=True)
         outcomes.append((killed, resumed.env_steps))
-        assert len(resumed.replay) == resumed.env_steps // 2
-        resumed.log.close()
+        assert len(resumed.learner.replay) == resumed.env_steps // 2
+        resumed.log.directory.close()
+        if not killed:
+            break
     assert outcomes[0] == (True, 60)
     assert outcomes[-1] == (False, 80)
     assert {steps for _, steps in outcomes} == {60, 80}
@@ -421,17 +390,18 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     assert sorted(path.name for path in (checkpoints / "resume").iterdir()) == [f"{steps:012d}" for steps in (60, 80)]
 
 
-def test_saving_the_same_step_again_never_leaves_it_without_a_checkpoint(tmp_path):
-    config = tiny_config()
+def test_saving_the_same_step_again_never_leaves_it_without_a_checkpoint(tmp_path, small_config, make_run):
+    config = small_config()
     run = make_run(config, tmp_path)
     for _ in range(30):
-        run.step()
+        run.learner.step()
     run.save()
-    for moment in range(1, 18):
-        killed_while_saving(run, moment)
+    killed = True
+    for moment in takewhile(lambda _: killed, count(1)):
+        killed = killed_while_saving(run, moment)
         store = CheckpointStore(tmp_path / "checkpoints")
         assert store.exists()
-        assert store.load(run.agent, build_replay(config)).counters["env_steps"] == 60
+        assert store.load(run.parts, build_replay(config)).name == f"{60:012d}"
 
 
 def killed_while_saving(run: TrainingRun, moment: int) -> bool:

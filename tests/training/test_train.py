@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import math
@@ -11,14 +10,13 @@ import pytest
 import torch
 import yaml
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, StepCounter, Transform
+from torchrl.envs import Transform
 
 pytest.importorskip("dm_control")
 
 from torchrl_etdmpc.collectors import NonFiniteError  # noqa: E402
-from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.envs import make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
-    RunLog,
     TrainConfig,
     TrainingRun,
     build_agent,
@@ -29,50 +27,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     preset,
 )
 
-EPISODE = 20  # decisions; the suite's own 500 would cost more than they show
-
-
-def tiny_config(**changes: Any) -> TrainConfig:
-    """Half a minute of a run in half a second; a group is changed by a dictionary."""
-    values: dict[str, Any] = {
-        "task": "cartpole-balance",
-        "preset": "cpu",
-        "total_env_steps": 160,
-        "compile": "off",
-        "eval_every": 80,
-        "eval_episodes": 1,
-        "checkpoint_every": 80,
-        "log_every": 2 * EPISODE,
-        "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
-        "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
-        "reanalyze": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 1},
-        "optim": {"batch_size": 4, "updates_per_decision": 2},
-        "replay": {"seed_decisions": 30, "pretrain_updates": 7},
-    }
-    values["reanalyze"] |= {"every": 3, "num_slices": 2}
-    for name, change in changes.items():
-        values[name] = {**values.get(name, {}), **change} if isinstance(change, dict) else change
-    return TrainConfig.from_dict(values)
-
-
-def make_env(config: TrainConfig, *transforms: Transform, num_envs: int = 1, seed: int = 0) -> EnvBase:
-    env = make_dmc_env(config.task, seed=seed, num_envs=num_envs, parallel=False)
-    for transform in (StepCounter(EPISODE), *transforms):
-        env = env.append_transform(transform)
-    return env
-
-
-def make_run(config: TrainConfig, run_dir: Path, *transforms: Transform) -> TrainingRun:
-    torch.manual_seed(0)
-    log = RunLog.create(run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps)
-    env = make_env(config, *transforms, num_envs=config.num_envs)
-    eval_env = make_env(config, num_envs=config.eval_episodes, seed=1)
-    return TrainingRun(config, env=env, eval_env=eval_env, log=log)
-
-
-def read_table(path: Path) -> list[dict[str, float]]:
-    with path.open(newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+EPISODE = 20  # decisions, of every run here
 
 
 class Finished(NamedTuple):
@@ -83,7 +38,7 @@ class Finished(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+def finished(tmp_path_factory: pytest.TempPathFactory, tiny_config, make_run) -> Finished:
     """A whole run: 30 seed decisions, 7 updates before and 2 per decision afterwards, 80 decisions in all."""
     config = tiny_config(eval_policy=True)
     path = tmp_path_factory.mktemp("runs") / "cartpole"
@@ -98,7 +53,7 @@ def test_a_run_directory_holds_what_it_should_and_nothing_else(finished):
     expected |= {
         f"checkpoints/resume/{steps:012d}/{name}"
         for steps in (80, 160)
-        for name in ("agent.pt", "run.pt", "manifest.json")
+        for name in (*(f"{part}.pt" for part in finished.run.parts), "manifest.json")
     }
     assert {file for file in files if not file.startswith("checkpoints/replay/")} == expected
     assert any(file.startswith("checkpoints/replay/rows-") for file in files)
@@ -109,38 +64,38 @@ def test_the_configuration_can_be_read_back(finished):
     assert TrainConfig.from_dict(values) == finished.config
 
 
-def test_evaluations_are_at_the_start_at_every_interval_and_at_the_end(finished):
+def test_evaluations_are_at_the_start_at_every_interval_and_at_the_end(finished, read_table):
     rows = read_table(finished.path / "eval.csv")
-    header = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes"
+    header = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes,policy_return"
     assert (finished.path / "eval.csv").read_text().splitlines()[0] == header
     assert [row["env_steps"] for row in rows] == [0, 80, 160]
     assert all(row["episodes"] == 1 and row["return_std"] == 0 for row in rows)
     assert all(0 < row["return_mean"] <= 2 * EPISODE for row in rows)
 
 
-def test_an_evaluation_due_at_the_end_of_the_seed_phase_is_of_the_pretrained_agent(tmp_path):
+def test_an_evaluation_due_at_the_end_of_the_seed_phase_is_of_the_pretrained_agent(tmp_path, tiny_config, make_run, read_table):
     make_run(tiny_config(eval_every=60, total_env_steps=70), tmp_path).run()
     rows = read_table(tmp_path / "eval.csv")
     assert [(row["env_steps"], row["updates"]) for row in rows] == [(0, 0), (60, 7), (70, 7 + 2 * 5)]
 
 
-def test_training_does_not_depend_on_how_often_it_is_evaluated(tmp_path):
+def test_training_does_not_depend_on_how_often_it_is_evaluated(tmp_path, tiny_config, make_run):
     often = make_run(tiny_config(eval_every=10, total_env_steps=90), tmp_path / "often")
     often.run()
     seldom = make_run(tiny_config(eval_every=1000, total_env_steps=90), tmp_path / "seldom")
     seldom.run()
-    assert torch.equal(often.replay[:]["action"], seldom.replay[:]["action"])
-    weights = zip(often.agent.loss.state_dict().values(), seldom.agent.loss.state_dict().values(), strict=True)
+    assert torch.equal(often.learner.replay[:]["action"], seldom.learner.replay[:]["action"])
+    weights = zip(often.learner.agent.loss.state_dict().values(), seldom.learner.agent.loss.state_dict().values(), strict=True)
     assert all(torch.equal(one, other) for one, other in weights)
 
 
-def test_a_training_row_is_written_at_every_interval_after_the_seed_phase(finished):
+def test_a_training_row_is_written_at_every_interval_after_the_seed_phase(finished, read_table):
     rows = read_table(finished.path / "train.csv")
     assert [row["env_steps"] for row in rows] == [80, 120, 160]
 
 
 @pytest.mark.parametrize("name", ["train.csv", "eval.csv"])
-def test_the_counters_agree_with_each_other_in_every_row(finished, name):
+def test_the_counters_agree_with_each_other_in_every_row(finished, name, read_table):
     rows = read_table(finished.path / name)
     assert list(rows[0])[:4] == ["env_steps", "decision_steps", "updates", "wall_time_s"]
     for row in rows:
@@ -151,11 +106,12 @@ def test_the_counters_agree_with_each_other_in_every_row(finished, name):
     assert times == sorted(times)
 
 
-def test_every_training_metric_is_there_and_finite(finished):
+def test_every_training_metric_is_there_and_finite(finished, read_table):
     rows = read_table(finished.path / "train.csv")
     names = {f"loss_{name}" for name in ("consistency", "reward", "value", "policy")}
-    names |= {"grad_norm_model", "grad_norm_policy", "policy_kl", "kl_scale", "value_target", "policy_return"}
+    names |= {"grad_norm_model", "grad_norm_policy", "policy_kl", "kl_scale", "value_target"}
     names |= {"episode_return", "targets_refreshed", "targets_stale", "target_age"}
+    names |= {"plan_fallbacks", "simulator_faults", "updates_skipped"}
     assert names <= set(rows[0])
     for row in rows:
         assert [name for name, value in row.items() if not math.isfinite(value)] == []
@@ -163,15 +119,15 @@ def test_every_training_metric_is_there_and_finite(finished):
     assert rows[-1]["targets_stale"] == 0
 
 
-def test_the_training_return_is_that_of_the_episodes_since_the_last_row(finished):
+def test_the_training_return_is_that_of_the_episodes_since_the_last_row(finished, read_table):
     # A row is written where an episode ends. The first one follows two episodes.
-    rewards = finished.run.replay[:]["next", "reward"].reshape(-1, EPISODE).sum(-1)
+    rewards = finished.run.learner.replay[:]["next", "reward"].reshape(-1, EPISODE).sum(-1)
     assert len(rewards) == 4
     expected = [rewards[:2].mean().item(), rewards[2].item(), rewards[3].item()]
     assert [row["episode_return"] for row in read_table(finished.path / "train.csv")] == pytest.approx(expected)
 
 
-def test_the_summary_states_the_run_and_its_result(finished):
+def test_the_summary_states_the_run_and_its_result(finished, read_table):
     summary = json.loads((finished.path / "summary.json").read_text())
     evaluations = [row["return_mean"] for row in read_table(finished.path / "eval.csv")]
     assert (summary["task"], summary["preset"], summary["seed"]) == ("cartpole-balance", "cpu", 1)
@@ -180,7 +136,7 @@ def test_the_summary_states_the_run_and_its_result(finished):
     assert summary["best_return"] == max(evaluations)
     assert summary["wall_time_s"] > 0
     assert summary["decisions_per_second"] > 0
-    assert summary["parameters"] == sum(p.numel() for p in finished.run.agent.world_model.parameters())
+    assert summary["parameters"] == sum(p.numel() for p in finished.run.learner.agent.world_model.parameters())
     assert summary["device"] == "cpu"
     assert {"python", "torch", "torchrl", "tensordict"} <= set(summary["versions"])
     assert {name: summary[name] for name in finished.summary} == finished.summary
@@ -190,112 +146,112 @@ def test_the_checkpoint_is_the_agent_at_the_end(finished):
     agent, config, counters = load_agent(finished.path / "checkpoints" / "last.pt", observation_dim=5, action_dim=1)
     assert config == finished.config
     assert (counters["env_steps"], counters["decision_steps"], counters["updates"]) == (160, 80, 107)
-    final = finished.run.agent.loss.state_dict()
+    final = finished.run.learner.agent.loss.state_dict()
     assert all(torch.equal(value, final[name]) for name, value in agent.loss.state_dict().items())
 
 
 def test_the_environments_are_closed_at_the_end(finished):
-    assert finished.run.collector.env.is_closed
-    assert finished.run.eval_env.is_closed
+    assert finished.run.learner.collector.env.is_closed
+    assert finished.run.evaluator.env.is_closed
 
 
 def test_every_decision_after_the_seed_phase_is_stored_with_a_planner_s_target(finished):
-    rows = finished.run.replay[:]
+    rows = finished.run.learner.replay[:]
     assert len(rows) == 80
     assert (rows["plan", "scale"][30:] != 1).all()
     assert set(rows["collector", "traj_ids"].tolist()) == {0, 1, 2, 3}
     assert not {"plan_mean", "is_init", "episode_reward", "done"} & set(rows.keys())
 
 
-def test_two_environments_keep_the_ratio_of_updates_to_decisions(tmp_path):
+def test_two_environments_keep_the_ratio_of_updates_to_decisions(tmp_path, tiny_config, make_run, read_table):
     # 31 seed decisions need 16 steps of two environments.
     config = tiny_config(num_envs=2, replay={"seed_decisions": 31}, total_env_steps=122, eval_every=1000)
     run = make_run(config, tmp_path)
     summary = run.run()
-    decisions = run.collector.frames
+    decisions = run.learner.collector.frames
     assert summary["env_steps"] == 2 * decisions == 124  # the first multiple of a step of both that reaches the budget
-    assert run.agent.updater.updates == 7 + 2 * (decisions - 32)
+    assert run.learner.agent.updater.updates == 7 + 2 * (decisions - 32)
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 124]
-    trajectories = run.replay[:]["collector", "traj_ids"]
+    trajectories = run.learner.replay[:]["collector", "traj_ids"]
     assert (trajectories[0::2] % 2 == 0).all()
     assert (trajectories[:40:2] == 0).all()
     assert (trajectories[1:40:2] == 1).all()
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
-def test_every_decision_of_every_environment_brings_its_share_of_reanalyze(tmp_path, num_envs):
+def test_every_decision_of_every_environment_brings_its_share_of_reanalyze(tmp_path, num_envs, tiny_config, make_run):
     run = make_run(tiny_config(num_envs=num_envs, reanalyze={"every": 4}, total_env_steps=200), tmp_path)
     refreshed = []
-    run.reanalyze.refresh = lambda batch: refreshed.append(run.collector.frames) or batch
+    run.learner.reanalyze.refresh = lambda batch: refreshed.append(run.learner.collector.frames) or batch
     run.run()
-    learned = run.collector.frames - math.ceil(30 / num_envs) * num_envs
+    learned = run.learner.collector.frames - math.ceil(30 / num_envs) * num_envs
     assert len(refreshed) == learned // 4
 
 
 @pytest.mark.parametrize("overlap", [False, True])
-def test_with_overlap_an_update_sees_the_data_of_the_decision_before(tmp_path, overlap):
+def test_with_overlap_an_update_sees_the_data_of_the_decision_before(tmp_path, overlap, tiny_config, make_run):
     run = make_run(tiny_config(overlap=overlap, num_envs=2, total_env_steps=122), tmp_path)
     sizes = []
-    update = run.agent.updater.step
+    update = run.learner.agent.updater.step
 
     def watched(batch, *, distill):
         if distill:
-            sizes.append(len(run.replay))
+            sizes.append(len(run.learner.replay))
         return update(batch, distill=distill)
 
-    run.agent.updater.step = watched
+    run.learner.agent.updater.step = watched
     run.run()
-    before = range(30, run.collector.frames, 2)  # rows in the buffer when a step of two environments begins
+    before = range(30, run.learner.collector.frames, 2)  # rows in the buffer when a step of two environments begins
     assert sizes == [rows + (0 if overlap else 2) for rows in before for _ in range(4)]
 
 
-def test_a_transition_can_be_sampled_before_the_next_decision(tmp_path):
+def test_a_transition_can_be_sampled_before_the_next_decision(tmp_path, tiny_config, make_run):
     run = make_run(tiny_config(), tmp_path)
     for number in range(1, 2 * EPISODE):
-        run.step()
-        assert len(run.replay) == number
+        run.learner.step()
+        assert len(run.learner.replay) == number
 
 
-def test_with_insertion_by_episode_only_whole_episodes_are_in_the_buffer(tmp_path):
+def test_with_insertion_by_episode_only_whole_episodes_are_in_the_buffer(tmp_path, tiny_config, make_run):
     config = tiny_config(
         total_env_steps=1100, replay={"insertion": "episode", "seed_decisions": 500, "pretrain_updates": 1}
     )
     run = make_run(config, tmp_path)
     for number in range(1, 3 * EPISODE):
-        run.step()
-        assert len(run.replay) == number // EPISODE * EPISODE
-    run.pretrain()
-    run.update()
-    assert run.agent.updater.updates == 2
+        run.learner.step()
+        assert len(run.learner.replay) == number // EPISODE * EPISODE
+    list(run.learner.pretrain())
+    run.learner.update()
+    assert run.learner.agent.updater.updates == 2
 
 
-def test_pretraining_neither_distils_nor_reanalyzes(tmp_path):
+def test_pretraining_neither_distils_nor_reanalyzes(tmp_path, tiny_config, make_run):
     run = make_run(tiny_config(reanalyze={"every": 1}), tmp_path)
     for _ in range(30):
-        run.step()
-    policy = {name: value.clone() for name, value in run.agent.world_model.policy.state_dict().items()}
-    encoder = run.agent.world_model.encoder.output.weight.clone()
-    run.pretrain()
-    assert run.agent.updater.updates == 7
-    assert (run.reanalyze.samples, run.reanalyze.refreshed) == (0, 0)
-    assert not torch.equal(run.agent.world_model.encoder.output.weight, encoder)
-    assert all(torch.equal(value, policy[name]) for name, value in run.agent.world_model.policy.state_dict().items())
-    run.update()
-    assert run.reanalyze.refreshed == 0  # every decision is every second update
-    run.update()
-    assert run.reanalyze.refreshed > 0
-    assert not torch.equal(run.agent.world_model.policy.output.weight, policy["output.weight"])
+        run.learner.step()
+    policy = {name: value.clone() for name, value in run.learner.agent.world_model.policy.state_dict().items()}
+    encoder = run.learner.agent.world_model.encoder.output.weight.clone()
+    list(run.learner.pretrain())
+    assert run.learner.agent.updater.updates == 7
+    assert (run.learner.reanalyze.samples, run.learner.reanalyze.refreshed) == (0, 0)
+    assert not torch.equal(run.learner.agent.world_model.encoder.output.weight, encoder)
+    assert all(torch.equal(value, policy[name]) for name, value in run.learner.agent.world_model.policy.state_dict().items())
+    run.learner.update()
+    assert run.learner.reanalyze.refreshed == 0  # every decision is every second update
+    run.learner.update()
+    assert run.learner.reanalyze.refreshed > 0
+    assert not torch.equal(run.learner.agent.world_model.policy.output.weight, policy["output.weight"])
 
 
-def test_a_run_without_reanalyze_has_no_metrics_of_it(tmp_path):
+def test_a_run_without_reanalyze_has_no_metrics_of_it(tmp_path, tiny_config, make_run, read_table):
     config = tiny_config(total_env_steps=70, log_every=5, eval_every=1000, reanalyze={"every": 0})
     run = make_run(config, tmp_path)
     run.run()
-    assert run.reanalyze is None
+    assert run.learner.reanalyze is None
     assert not [name for name in read_table(tmp_path / "train.csv")[0] if name.startswith("target")]
 
 
-def test_the_return_of_no_finished_episode_is_not_a_number(tmp_path):
+def test_the_return_of_no_finished_episode_is_not_a_number(tmp_path, tiny_config, make_run, read_table):
     config = tiny_config(total_env_steps=70, log_every=4, eval_every=1000)
     make_run(config, tmp_path).run()
     rows = read_table(tmp_path / "train.csv")
@@ -322,7 +278,7 @@ class BreakingReward(Transform):
 
 
 @pytest.mark.parametrize(("steps", "updates"), [(10, 0), (33, 7 + 2 * 3)], ids=["while seeding", "while learning"])
-def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(tmp_path, steps, updates):
+def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(tmp_path, steps, updates, tiny_config, make_run):
     run = make_run(tiny_config(max_faults=3), tmp_path, BreakingReward(steps))
     message = rf"reward.* at decision step {steps} .*; training goes on with a fresh episode \(failure \d\)\.$"
     with (
@@ -335,10 +291,10 @@ def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(tmp_
     agent, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
     assert (counters["decision_steps"], counters["updates"]) == (steps, updates)
     assert agent.updater.updates == updates
-    assert len(run.replay) == steps
+    assert len(run.learner.replay) == steps
     assert not (tmp_path / "summary.json").exists()
-    assert run.collector.env.is_closed
-    assert run.eval_env.is_closed
+    assert run.learner.collector.env.is_closed
+    assert run.evaluator.env.is_closed
 
 
 class Crash(Transform):
@@ -358,25 +314,25 @@ class Crash(Transform):
         return tensordict_reset
 
 
-def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path):
+def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path, tiny_config, make_run, read_table):
     run = make_run(tiny_config(max_faults=2, total_env_steps=240), tmp_path, Crash(5, 42, 95))
     with pytest.warns(UserWarning, match=r"^the environment failed at decision step \d+: the physics is inv") as warned:
         summary = run.run()
     assert len(warned) == 3
     assert summary["env_steps"] == 240
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 80, 160, 240]
-    assert len(run.replay) == 120
-    assert run.agent.updater.updates == 7 + 2 * 90
-    rows = run.replay[:]
+    assert len(run.learner.replay) == 120
+    assert run.learner.agent.updater.updates == 7 + 2 * 90
+    rows = run.learner.replay[:]
     ends = rows["collector", "traj_ids"].diff() != 0
     assert rows["next", "done"].squeeze(-1)[:-1][ends].all()
     assert rows["next", "truncated"].sum() == rows["next", "done"].sum()
     assert read_table(tmp_path / "train.csv")[-1]["simulator_faults"] == 3
 
 
-def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path):
+def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path, tiny_config, make_run, read_table):
     run = make_run(tiny_config(), tmp_path)
-    step = run.eval_env.step_and_maybe_reset
+    step = run.evaluator.env.step_and_maybe_reset
     calls = []
 
     def break_once(tensordict: TensorDictBase):
@@ -385,27 +341,27 @@ def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path):
             raise RuntimeError("no more of it")
         return step(tensordict)
 
-    run.eval_env.step_and_maybe_reset = break_once
+    run.evaluator.env.step_and_maybe_reset = break_once
     message = r"^the evaluation at 80 env steps failed \(no more of it\); training goes on\.$"
     with pytest.warns(UserWarning, match=message):
         run.run()
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 160]
 
 
-def test_an_evaluation_that_fails_before_anything_was_learned_is_an_error(tmp_path):
+def test_an_evaluation_that_fails_before_anything_was_learned_is_an_error(tmp_path, tiny_config, make_run):
     run = make_run(tiny_config(), tmp_path)
 
     def fail(tensordict: TensorDictBase):
         raise RuntimeError("wrong sizes")
 
-    run.eval_env.step_and_maybe_reset = fail
+    run.evaluator.env.step_and_maybe_reset = fail
     with pytest.raises(RuntimeError, match="wrong sizes"):
         run.run()
 
 
-def test_updates_that_stay_without_a_finite_gradient_stop_the_run_and_name_the_term(tmp_path):
+def test_updates_that_stay_without_a_finite_gradient_stop_the_run_and_name_the_term(tmp_path, tiny_config, make_run):
     run = make_run(tiny_config(max_skipped=20, optim={"updates_per_decision": 1}), tmp_path)
-    step, calls = run.agent.updater.step, []
+    step, calls = run.learner.agent.updater.step, []
 
     def poisoned(batch: TensorDictBase, *, distill: bool = True):
         calls.append(1)
@@ -413,25 +369,25 @@ def test_updates_that_stay_without_a_finite_gradient_stop_the_run_and_name_the_t
             batch["next", "reward"][0] = torch.nan
         return step(batch, distill=distill)
 
-    run.agent.updater.step = poisoned
+    run.learner.agent.updater.step = poisoned
     with pytest.raises(NonFiniteError, match=r"^the last \d+ updates had no finite gradient .* loss_reward, "):
         run.run()
     agent, _, _ = load_agent(tmp_path / "checkpoints" / "last.pt")
     assert all(value.isfinite().all() for value in agent.loss.state_dict().values())
-    assert 20 <= int(run.agent.updater.skipped) < 60
+    assert 20 <= int(run.learner.agent.updater.skipped) < 60
 
 
-def test_any_other_error_closes_the_environments_too(tmp_path, monkeypatch):
+def test_any_other_error_closes_the_environments_too(tmp_path, monkeypatch, tiny_config, make_run):
     run = make_run(tiny_config(), tmp_path)
 
     def fail(*_: Any) -> None:
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr(run, "pretrain", fail)
+    monkeypatch.setattr(run.learner, "pretrain", fail)
     with pytest.raises(RuntimeError, match="out of memory"):
         run.run()
-    assert run.collector.env.is_closed
-    assert run.eval_env.is_closed
+    assert run.learner.collector.env.is_closed
+    assert run.evaluator.env.is_closed
     assert not (tmp_path / "summary.json").exists()
 
 
@@ -454,7 +410,7 @@ def test_the_paper_s_method_runs_on_a_real_task(task, sizes, iterations):
         replay=dataclasses.replace(base.replay, seed_decisions=12),
     )
     torch.manual_seed(0)
-    env = make_dmc_env(task, seed=0)
+    env = make_env(task, seed=0)
     assert (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]) == sizes
     agent, replay = build_agent(config, *sizes), build_replay(config)
     assert agent.planner.iterations == agent.reanalyze_planner.iterations == iterations

@@ -16,7 +16,7 @@ except ImportError as error:
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS, HUMANOIDBENCH_HARD, Benchmark, benchmark_of, get_benchmark
 from torchrl_etdmpc.analysis.comparison import Comparison, compare, merge_estimates
 from torchrl_etdmpc.analysis.curves import find_runs, join_curves, read_curves, read_run, read_runs
-from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves
+from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run
 from torchrl_etdmpc.analysis.report import write_report
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
 from torchrl_etdmpc.analysis.statistics import (
@@ -61,6 +61,7 @@ __all__ = [
     "plot_aggregate",
     "plot_auc",
     "plot_curves",
+    "plot_run",
     "probability_of_improvement",
     "rank_methods",
     "read_curves",

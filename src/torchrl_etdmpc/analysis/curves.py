@@ -14,15 +14,18 @@ import os
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
 
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
+from torchrl_etdmpc.runs import RunDirectory
 
 SEED_COLUMNS = ("method", "task", "seed", "env_steps", "return_mean")
 ESTIMATE_COLUMNS = ("method", "task", "env_steps", "mean", "standard_error", "seeds")
+_EVAL = RunDirectory("").eval.name
 _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
 
 
@@ -42,9 +45,9 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     for path in map(Path, paths):
         if not path.exists():
             raise FileNotFoundError(f"no such run directory: {path}.")
-        found = {file.parent for file in path.rglob("eval.csv")}
+        found = {file.parent for file in path.rglob(_EVAL)}
         if not found:
-            raise FileNotFoundError(f"no runs found in {path}; a run directory holds an eval.csv.")
+            raise FileNotFoundError(f"no runs found in {path}; a run directory holds an {_EVAL}.")
         runs |= found
     return sorted(runs)
 
@@ -66,12 +69,8 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
         FileNotFoundError: a file is missing.
         ValueError: a file is not what it should be, or counts steps in other units.
     """
-    run_dir = Path(run_dir)
-    header = _header(run_dir)
-    text = (run_dir / "eval.csv").read_text(encoding="utf-8", errors="replace")
-    table = _parse(text[: text.rfind("\n") + 1], run_dir / "eval.csv", ("env_steps", "return_mean"), empty=True)
-    _check_units(table.assign(task=header["task"]), run_dir / "eval.csv")
-    table = table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
+    header, table = readread_header(run_dir), read_evaluations(run_dir)
+    _check_units(table.assign(task=header["task"]), RunDirectory(run_dir).eval)
     return pd.DataFrame(
         {
             "method": method or header["preset"],
@@ -81,6 +80,45 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
             "return_mean": table["return_mean"].astype(float),
         }
     )
+
+
+def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
+    """Task, preset and seed of a run.
+
+    Raises:
+        FileNotFoundError: if it has neither ``config.yaml`` nor ``summary.json``.
+        ValueError: if the file does not give them.
+    """
+    directory = RunDirectory(run_dir)
+    files = [file for file in (directory.config, directory.summary) if file.is_file()]
+    if not files:
+        raise FileNotFoundError(
+            f"{directory} has neither {directory.config.name} nor {directory.summary.name}, which name its task and "
+            "seed."
+        )
+    text = files[0].read_text(encoding="utf-8", errors="replace")
+    try:
+        values = json.loads(text) if files[0] == directory.summary else yaml.safe_load(text)
+        header = {key: values[key] for key in ("task", "preset", "seed")}
+    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise ValueError(f"{files[0]} does not give the run's task, preset and seed.") from error
+    kinds = {"task": str, "preset": str, "seed": int}
+    if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
+        raise ValueError(f"{files[0]} does not give the run's task, preset and seed.")
+    return header
+
+
+def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
+    """The rows of a run's ``eval.csv``, in the order of ``env_steps``; see :func:`read_run`.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is not what it should be.
+    """
+    file = RunDirectory(run_dir).eval
+    text = file.read_text(encoding="utf-8", errors="replace")
+    table = _parse(text[: text.rfind("\n") + 1], file, ("env_steps", "return_mean"), empty=True)
+    return table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
 
 
 def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = None) -> pd.DataFrame:
@@ -93,7 +131,7 @@ def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = N
     tables, seen = [], {}
     for run_dir in find_runs(paths):
         table = read_run(run_dir, method=method)
-        header = _header(run_dir)
+        header = read_header(run_dir)
         key = (method or header["preset"], header["task"], header["seed"])
         if key in seen:
             raise ValueError(
@@ -164,25 +202,6 @@ def join_curves(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
         seen |= curves
         joined.append(table)
     return pd.concat(joined, ignore_index=True)
-
-
-def _header(run_dir: Path) -> dict[str, object]:
-    """Task, preset and seed of a run."""
-    for name in ("config.yaml", "summary.json"):
-        if (run_dir / name).is_file():
-            break
-    else:
-        raise FileNotFoundError(f"{run_dir} has neither config.yaml nor summary.json, which name its task and seed.")
-    text = (run_dir / name).read_text(encoding="utf-8", errors="replace")
-    try:
-        values = json.loads(text) if name == "summary.json" else yaml.safe_load(text)
-        header = {key: values[key] for key in ("task", "preset", "seed")}
-    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
-        raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed.") from error
-    kinds = {"task": str, "preset": str, "seed": int}
-    if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
-        raise ValueError(f"{run_dir / name} does not give the run's task, preset and seed.")
-    return header
 
 
 def _parse(text: str, file: Path, columns: tuple[str, ...], *, empty: bool = False) -> pd.DataFrame:

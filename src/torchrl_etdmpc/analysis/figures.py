@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,7 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
+from torchrl_etdmpc.analysis.curves import read_evaluations, read_header
 from torchrl_etdmpc.analysis.statistics import Z_95, add_interval, interpolate
+from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.runs.files import replacing
 
 # The palette of Okabe and Ito, which people with any colour vision tell apart. Published baselines keep their colour in
 # every report; the rest goes to the runs in their order.
@@ -36,6 +41,40 @@ def method_styles(methods: Sequence[str]) -> dict[str, dict[str, str]]:
             styles[method] = {"color": color, "linestyle": dash, "marker": "o"}
             others += 1
     return styles
+
+
+def plot_run(run_dir: str | os.PathLike[str]) -> Path:
+    """Draws the ``curve.png`` of one run: mean return against env steps, with a band of one standard deviation.
+
+    Args:
+        run_dir (str or Path): of a run that is under way or done.
+
+    Returns:
+        Path: the picture.
+
+    Raises:
+        FileNotFoundError: if it has not evaluated, or does not say what was trained.
+        ValueError: if no evaluation has a finite return.
+    """
+    directory, header, table = RunDirectory(run_dir), read_header(run_dir), read_evaluations(run_dir)
+    mean = table["return_mean"]
+    if not np.isfinite(mean).any():
+        raise ValueError(f"run_dir={directory} needs an evaluation with a finite return, got none; evaluate first.")
+    std = table["return_std"].fillna(0) if "return_std" in table else 0.0
+    figure = Figure(figsize=(6.4, 4.0), dpi=150, layout="tight")
+    axis = figure.subplots()
+    style = {"color": _RUNS[0], "linewidth": 1.5, "marker": "o", "markersize": 4}
+    axis.plot(table["env_steps"], mean, **style, label="mean over the evaluation's episodes")
+    band = {"color": _RUNS[0], "alpha": 0.18, "linewidth": 0, "label": "\N{PLUS-MINUS SIGN} 1 standard deviation"}
+    axis.fill_between(table["env_steps"], mean - std, mean + std, **band)
+    _dress(axis, max(table["env_steps"].max(), 1))
+    axis.set_xlabel("environment steps")
+    axis.set_ylabel("episode return")
+    axis.set_title(f"{header['task']}, {header['preset']}, seed {header['seed']}")
+    axis.legend(frameon=False, loc="best")
+    with replacing(directory.curve) as partial:
+        figure.savefig(partial, format="png")
+    return directory.curve
 
 
 def plot_curves(estimates: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str], budget: float) -> Figure:

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
+from torchrl_etdmpc.runs.errors import first_line
 
 TRAJ_KEY = ("collector", "traj_ids")
 
@@ -54,7 +55,7 @@ class StepCollector(BaseCollector):
             the buffer keeps, e.g. :class:`SeedPolicy`. Required if ``init_random_frames`` is positive.
         insertion (str): ``"step"`` or ``"episode"``. Default: ``"step"``.
         exclude_keys (sequence of NestedKey): what not to store. Default: the warm start, ``"plan_mean"`` and
-            ``("next", "plan_mean")``.
+            ``("next", "plan_mean")``, and ``("plan", "fallback")``.
         exploration_type (ExplorationType): Default: ``RANDOM``.
         policy_device (torch.device, optional): where the policy's inputs go. Default: the environment's device.
 
@@ -86,7 +87,7 @@ class StepCollector(BaseCollector):
         init_random_frames: int = 0,
         seed_policy: nn.Module | None = None,
         insertion: Insertion = "step",
-        exclude_keys: Sequence[NestedKey] = ("plan_mean", ("next", "plan_mean")),
+        exclude_keys: Sequence[NestedKey] = ("plan_mean", ("next", "plan_mean"), ("plan", "fallback")),
         exploration_type: ExplorationType = ExplorationType.RANDOM,
         policy_device: torch.device | str | None = None,
     ) -> None:
@@ -147,33 +148,42 @@ class StepCollector(BaseCollector):
     def __iter__(self) -> Iterator[TensorDictBase]:
         return self.iterator()
 
-    @torch.no_grad()
-    def step(self, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
+    def step(self) -> TensorDictBase:
         """One decision of every environment: act, step, check, store.
-
-        Args:
-            meanwhile (callable, optional): called between acting and stepping, e.g. to queue an update on a GPU that
-                runs while the simulator does; it sees the buffer without this step.
 
         Returns:
             The transitions, batch size of the environment; what is not stored is in them too.
+        """
+        return self.finish_step(self.act())
+
+    @torch.no_grad()
+    def act(self) -> TensorDictBase:
+        """The first half of :meth:`step`: what the policy decides in the present states.
+
+        Work that is queued on a device between the halves, e.g. an update, runs while the simulator steps; it sees the
+        buffer without this step.
         """
         if self._carrier is None:
             self._carrier = self._start(self._ask(self.env.reset))
             self._after_reset = True
         if self._after_reset:
             self._check_finite(self._carrier, self._checked_before, "the environment")
-        seeding = self.in_seed_phase
         with set_exploration_type(self.exploration_type):
-            tensordict = self._act(self._carrier, seeding)
+            tensordict = self._act(self._carrier, self.in_seed_phase)
         self._check_finite(tensordict, self.env.action_keys, "the policy")
-        if meanwhile is not None:
-            with torch.enable_grad():
-                meanwhile()
-        stepped, carrier = self._ask(self.env.step_and_maybe_reset, tensordict)
+        return tensordict
+
+    @torch.no_grad()
+    def finish_step(self, acted: TensorDictBase) -> TensorDictBase:
+        """The second half of :meth:`step`: steps the environments, checks and stores.
+
+        Args:
+            acted (TensorDictBase): what :meth:`act` returned.
+        """
+        stepped, carrier = self._ask(self.env.step_and_maybe_reset, acted)
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
-        self._check_schema(kept, seeding)
+        self._check_schema(kept, self.in_seed_phase)
         self._store(kept)
         self._frames += self.num_envs
         self._carrier = self._next_carrier(carrier, stepped)
@@ -185,8 +195,9 @@ class StepCollector(BaseCollector):
             return method(*args)
         except Exception as error:
             self._truncate_episodes()
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise SimulatorError(f"the environment failed at decision step {self._frames}: {reason}") from error
+            raise SimulatorError(
+                f"the environment failed at decision step {self._frames}: {first_line(error)}"
+            ) from error
 
     def _act(self, tensordict: TensorDictBase, seeding: bool) -> TensorDictBase:
         policy = self.seed_policy if seeding else self.policy

@@ -1,42 +1,37 @@
-"""Training: configuration, assembly, updates, evaluation, checkpoints and logs."""
+"""Training: configuration, assembly, updates, evaluation, and one run from a command to its summary."""
 
+from torchrl_etdmpc.checkpoints import CheckpointError
+from torchrl_etdmpc.training.agent import Agent, build_agent, build_planner, build_world_model
+from torchrl_etdmpc.training.agent_file import AgentFile, load_agent, read_agent_file, save_agent
 from torchrl_etdmpc.training.builders import (
-    Agent,
-    build_agent,
     build_collector,
-    build_planner,
     build_reanalyze,
     build_replay,
-    build_world_model,
     resolve_device,
     row_bytes,
 )
-from torchrl_etdmpc.training.checkpoint import CheckpointError, load_agent, read_checkpoint, save_checkpoint
 from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, one_line_errors
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.curve import plot_curve
-from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
-from torchrl_etdmpc.training.export import export_planner, export_policy
+from torchrl_etdmpc.training.evaluate import BarePolicy, EvaluationResult, Evaluator, evaluate
+from torchrl_etdmpc.training.launch import Launch, launch, plan_launch, read_run_config, resumed_config
+from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.presets import PRESETS, preset
-from torchrl_etdmpc.training.progress import progress_bar
-from torchrl_etdmpc.training.resume import read_run_config, resumed_config
-from torchrl_etdmpc.training.run_log import RunLog
 from torchrl_etdmpc.training.signals import EXIT_CODE, RunInterrupted
-from torchrl_etdmpc.training.store import CheckpointStore
 from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
-from torchrl_etdmpc.training.versions import library_versions
-from torchrl_etdmpc.training.video import write_mp4
 
 __all__ = [
     "EXIT_CODE",
     "PRESETS",
     "Agent",
+    "AgentFile",
     "BarePolicy",
     "CheckpointError",
-    "CheckpointStore",
+    "EvaluationResult",
+    "Evaluator",
+    "Launch",
+    "Learner",
     "RunInterrupted",
-    "RunLog",
     "TrainConfig",
     "TrainingRun",
     "Updater",
@@ -48,20 +43,16 @@ __all__ = [
     "build_world_model",
     "evaluate",
     "explicit_settings",
-    "export_planner",
-    "export_policy",
     "hydra_main",
-    "library_versions",
+    "launch",
     "load_agent",
     "one_line_errors",
-    "plot_curve",
+    "plan_launch",
     "preset",
-    "progress_bar",
-    "read_checkpoint",
+    "read_agent_file",
     "read_run_config",
     "resolve_device",
     "resumed_config",
     "row_bytes",
-    "save_checkpoint",
-    "write_mp4",
+    "save_agent",
 ]

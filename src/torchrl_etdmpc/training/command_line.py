@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from torchrl_etdmpc.envs import import_task
 from torchrl_etdmpc.training.config import TrainConfig, config_from_dict
 from torchrl_etdmpc.training.presets import PRESETS, preset
 
@@ -64,6 +65,8 @@ def hydra_main(
                 from omegaconf import OmegaConf
             except ImportError as error:
                 raise ImportError("the examples need hydra-core; run: pip install torchrl_etdmpc[train]") from error
+            sys.argv[1:] = [_without_task_prefix(argument) for argument in sys.argv[1:]]
+            _import_tasks(sys.argv[1:])
             os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us instead of being printed over many lines
             for name, values in PRESETS.items():
                 ConfigStore.instance().store(group="preset", name=name, node=values.to_dict(), package="_global_")
@@ -92,6 +95,39 @@ def explicit_settings(arguments: list[str] | None = None) -> list[str]:
     given = sys.argv[1:] if arguments is None else arguments
     names = [argument.lstrip("+").partition("=")[0] for argument in given if "=" in argument]
     return [name for name in names if not name.startswith(("hydra", "-", "~"))]
+
+
+_TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
+
+
+def _without_task_prefix(argument: str) -> str:
+    """``task.action_repeat=2`` as the setting ``action_repeat=2``: ``task`` itself is a name, not a group."""
+    name, equals, value = argument.partition("=")
+    group, _, setting = name.partition(".")
+    return f"{setting}{equals}{value}" if group == "task" and setting in _TASK_SETTINGS else argument
+
+
+def _import_tasks(arguments: list[str]) -> None:
+    """Follows a task that is a path to code, ``task=package.module:function``.
+
+    Only the command line can make this process import code: a stored configuration that names such a task is refused
+    unless the command repeats it.
+    """
+    given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
+    settings = {}
+    for name in _TASK_SETTINGS:
+        try:
+            if name in given and given[name] != "null":
+                settings[name] = _TRUTH[given[name].lower()] if name == "terminates" else int(float(given[name]))
+        except (KeyError, ValueError) as error:
+            kind = "true or false" if name == "terminates" else "a whole number"
+            raise ValueError(f"task.{name} must be {kind}, got {given[name]!r}.") from error
+    for task in given.get("task", "").split(","):  # a sweep names several
+        if ":" in task:
+            import_task(task, **settings)
+
+
+_TRUTH = {"true": True, "false": False}
 
 
 def _check_preset(arguments: list[str]) -> None:

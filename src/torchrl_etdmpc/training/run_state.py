@@ -1,62 +1,52 @@
-"""What the continuation of a run depends on besides weights and buffer, as tensors and plain containers."""
+"""Where a run is, and what it still owes: the part of a checkpoint that no other part owns."""
 
 from __future__ import annotations
 
 import time
-import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
-from torchrl.checkpoint import GlobalRNGState
-
-from torchrl_etdmpc.envs import load_simulator_state
-
-if TYPE_CHECKING:
-    from torchrl_etdmpc.training.train import TrainingRun
-
-_COUNTED = ("samples", "refreshed", "stale", "target_age")
+Stage = Literal["random", "pretrain", "learn"]
+Duty = Literal["evaluation", "checkpoint", "train_row"]
 
 
-def capture(run: TrainingRun) -> dict[str, Any]:
-    """Random numbers, the place inside the episode and inside the run, and how long the log's files are."""
-    reanalyze = None if run.reanalyze is None else {name: getattr(run.reanalyze, name) for name in _COUNTED}
-    return {
-        "collector": dict(run.collector.state_dict()),
-        "sampler": run.replay.sampler.state_dict(),
-        "reanalyze": reanalyze,
-        "eval_simulator": run.eval_simulator,
-        "log": run.log.state_dict(),
-        "place": {
-            "stage": run.stage,
-            "pretrained": run.pretrained,
-            "pending": list(run.pending),
-            "eval_returns": list(run.eval_returns),
-            "episode_returns": list(run.episode_returns),
-            "metrics": dict(run.metrics),
-            "wall_s": run.wall_s,
-            "learning_s": run.learning_s,
-            "best_saved": run.best_saved,
-            "faults": [run.faults, run.faults_in_a_row],
-        },
-        "random": GlobalRNGState().state_dict(),
-    }
+@dataclass
+class RunState:
+    """The place inside a run, as plain values.
 
+    Attributes:
+        stage (str): ``"random"`` phase, then ``"pretrain"``, then ``"learn"``.
+        due (list of str): what the last step called for and is not done yet, in order. These names are stored.
+        eval_returns (list of float): mean return of every evaluation so far.
+        best_saved (float): latest evaluation before the best checkpoint.
+        learning_s (float): seconds of acting and updating, without random phase, pretraining and evaluations.
+        wall_s (float): seconds of work before this process.
+    """
 
-def restore(run: TrainingRun, state: dict[str, Any]) -> None:
-    """Brings a run back to where :func:`capture` was called; weights and buffer are restored already."""
-    run.collector.load_state_dict(state["collector"])
-    run.replay.sampler.load_state_dict(state["sampler"])
-    if run.reanalyze is not None and state["reanalyze"] is not None:
-        for name, value in state["reanalyze"].items():
-            setattr(run.reanalyze, name, value)
-    run.eval_simulator = state["eval_simulator"]
-    if run.eval_simulator is not None and not load_simulator_state(run.eval_env, run.eval_simulator):
-        warnings.warn("the evaluation environment did not come back to where it was.", stacklevel=2)
-    run.log.load_state_dict(state["log"])
-    place = state["place"]
-    run.stage, run.pretrained, run.pending = place["stage"], place["pretrained"], list(place["pending"])
-    run.eval_returns, run.episode_returns = list(place["eval_returns"]), list(place["episode_returns"])
-    run.metrics = {name: value.to(run.device) for name, value in place["metrics"].items()}
-    run.learning_s, run.best_saved = place["learning_s"], place["best_saved"]
-    run.faults, run.faults_in_a_row = place["faults"]
-    run.start = time.perf_counter() - place["wall_s"]
-    GlobalRNGState().load_state_dict(state["random"])  # last: building the parts has drawn from them
+    stage: Stage = "random"
+    due: list[Duty] = field(default_factory=lambda: ["evaluation"])
+    eval_returns: list[float] = field(default_factory=list)
+    best_saved: float = float("-inf")
+    learning_s: float = 0.0
+    wall_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._started = time.perf_counter()
+
+    @property
+    def wall_time_s(self) -> float:
+        """Seconds of work so far, those before an interruption included."""
+        return self.wall_s + time.perf_counter() - self._started
+
+    def state_dict(self) -> dict[str, Any]:
+        """The attributes as they are now."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)} | {"wall_s": self.wall_time_s}
+        return {name: list(value) if isinstance(value, list) else value for name, value in values.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores :meth:`state_dict`."""
+        for entry in fields(self):
+            value = state_dict[entry.name]
+            setattr(self, entry.name, list(value) if isinstance(value, list) else value)
+        self._started = time.perf_counter()

@@ -40,6 +40,9 @@ class Updater:
         compile_mode (str, optional): ``torch.compile`` mode of loss and clipped gradient, one graph. Default: ``None``,
             eager. An update without distillation is always eager: pretraining is short.
 
+    Raises:
+        ValueError: if an argument is out of range.
+
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.testing import random_slices
     >>> updater = Updater(EfficientTDMPCLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=32), discount=0.99))
@@ -57,6 +60,13 @@ class Updater:
         tau: float = 0.01,
         compile_mode: str | None = None,
     ) -> None:
+        for name, number in {"lr": lr, "grad_clip_norm": grad_clip_norm}.items():
+            if not number > 0:
+                raise ValueError(f"{name} must be positive, got {number}.")
+        if not encoder_lr_scale >= 0:
+            raise ValueError(f"encoder_lr_scale must not be negative, got {encoder_lr_scale}.")
+        if not 0 <= tau <= 1:
+            raise ValueError(f"tau must be in [0, 1], got {tau}.")
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
@@ -153,14 +163,15 @@ class Updater:
     def _gradients(
         self, slices: Slices, target_values: dict[str, Tensor]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-        """Losses and metrics, the clipped gradient of the summed losses in the layout of each part, and 1.0 to skip."""
+        """Losses and metrics, the clipped gradient of the summed losses in the layout of each part, and 1.0 to skip.
+
+        All of it is one graph when it is compiled, so nothing here may wait for the device or depend on a value.
+        """
         out = self.loss.evaluate(slices, target_values)
         total = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
         clipped = {"model": ("encoder", "heads", "values")} | ({"policy": ("policy",)} if self.loss.distill else {})
-        parts = {part: self.parts[part] for names in clipped.values() for part in names}
-        every = iter(torch.autograd.grad(total, [p for tensors in parts.values() for p in tensors]))
-        gradients = {part: _joined([next(every) for _ in tensors]) for part, tensors in parts.items()}
+        gradients = self._flat_gradients(total, [part for names in clipped.values() for part in names])
         for name, names in clipped.items():
             norm = torch.stack([gradients[part].norm() for part in names]).norm()
             factor = (self.grad_clip_norm / (norm + 1e-6)).clamp(max=1)  # as torch.nn.utils.clip_grad_norm_
@@ -168,6 +179,11 @@ class Updater:
             metrics[f"grad_norm_{name}"] = norm
         norms = torch.stack([metrics[f"grad_norm_{name}"] for name in clipped])
         return metrics, gradients, norms.isfinite().all().logical_not().float()
+
+    def _flat_gradients(self, total: Tensor, parts: list[str]) -> dict[str, Tensor]:
+        """The gradient of each part, in the layout of its piece of memory."""
+        every = iter(torch.autograd.grad(total, [p for part in parts for p in self.parts[part]]))
+        return {part: _joined([next(every) for _ in self.parts[part]]) for part in parts}
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser and the counts of skipped updates (the weights belong to the loss)."""

@@ -5,26 +5,25 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Any
 
-__all__ = ["ProgressBar", "progress_bar"]
-
 
 def progress_bar(total_env_steps: int, *, initial: int = 0) -> ProgressBar:
     """A bar on stderr: environment steps, last return, decisions per second, time left; silent off a terminal.
 
     Args:
-        total_env_steps: length of the run in environment steps.
-        initial: environment steps already done, for a run that goes on from a checkpoint.
+        total_env_steps (int): length of the run in environment steps.
+
+    Keyword Args:
+        initial (int): environment steps already done, for a run that goes on from a checkpoint. Default: 0.
 
     Returns:
-        The bar; a context manager.
+        ProgressBar: a context manager.
 
     Raises:
-        ImportError: tqdm is not installed.
+        ImportError: if tqdm is not installed.
 
-    Examples:
-        >>> with progress_bar(1000) as bar:
-        ...     for env_steps in range(2, 1001, 2):
-        ...         bar.update(env_steps=env_steps, decision_steps=env_steps // 2)
+    >>> with progress_bar(1000) as bar:
+    ...     for env_steps in range(2, 1001, 2):
+    ...         bar.update(env_steps=env_steps, decision_steps=env_steps // 2)
     """
     try:
         from tqdm import tqdm
@@ -45,20 +44,20 @@ class ProgressBar:
     """Made by :func:`progress_bar`; takes absolute counters, so that a missed update costs nothing.
 
     Args:
-        bar: a tqdm bar that counts environment steps.
+        bar (tqdm): counts environment steps.
     """
 
-    def __init__(self, bar: Any):
+    def __init__(self, bar: Any) -> None:
         self._bar = bar
         self._last_return: float | None = None
 
     def update(self, *, env_steps: int, decision_steps: int, last_return: float | None = None) -> None:
-        """Move the bar.
+        """Moves the bar.
 
-        Args:
-            env_steps: environment steps so far.
-            decision_steps: actions chosen so far.
-            last_return: return of the last episode, if there is a new one; the bar keeps showing it.
+        Keyword Args:
+            env_steps (int): environment steps so far.
+            decision_steps (int): actions chosen so far.
+            last_return (float, optional): of the last evaluation, if there is a new one; the bar keeps showing it.
         """
         if self._bar.disable:
             return
@@ -74,7 +73,7 @@ class ProgressBar:
         self._bar.update(env_steps - self._bar.n)
 
     def close(self) -> None:
-        """Leave the bar as it stands and end its line."""
+        """Leaves the bar as it stands and ends its line."""
         self._bar.close()
 
     def __enter__(self) -> ProgressBar:

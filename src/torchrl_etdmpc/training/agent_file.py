@@ -1,63 +1,78 @@
-"""Checkpoints: weights, optimiser and counters in one file that holds no code."""
+"""Agent files: weights, optimiser, configuration and counters, in a file that holds no code."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from torchrl_etdmpc.training.atomic_file import replacing
-from torchrl_etdmpc.training.builders import Agent, build_agent
+from torchrl_etdmpc.checkpoints import CheckpointError
+from torchrl_etdmpc.runs.files import write_tensors
+from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
 FORMAT = 2
 _ENTRIES = {"config", "observation_dim", "action_dim", "world_model", "loss", "updater", "counters"}
 
 
-class CheckpointError(RuntimeError):
-    """A file that cannot be used as a checkpoint, and why."""
+class AgentFile:
+    """An agent as a part of a checkpoint: its state is what an agent file holds.
+
+    Args:
+        agent (Agent): the parts.
+        config (TrainConfig): the run.
+        counters (callable): returns e.g. env_steps, decision_steps, updates.
+    """
+
+    def __init__(self, agent: Agent, config: TrainConfig, counters: Callable[[], Mapping[str, int | float]]) -> None:
+        self.agent = agent
+        self.config = config
+        self.counters = counters
+
+    def state_dict(self) -> dict[str, Any]:
+        """The content of the file."""
+        return {
+            "format": FORMAT,
+            "config": self.config.to_dict(),
+            "observation_dim": self.agent.world_model.observation_dim,
+            "action_dim": self.agent.world_model.action_dim,
+            "counters": dict(self.counters()),
+            **self.agent.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Gives the agent the weights, targets, running scale and optimiser of :meth:`state_dict`."""
+        self.agent.load_state_dict(state_dict)
 
 
-def save_checkpoint(path: str | Path, agent: Agent, config: TrainConfig, counters: dict[str, int | float]) -> Path:
-    """Writes weights, target weights, running scale, optimiser states, configuration and counters.
-
-    The file is written under a temporary name and moved into place, so a run that is cut off leaves no half file.
+def save_agent(path: str | Path, agent: Agent, config: TrainConfig, counters: Mapping[str, int | float]) -> Path:
+    """Writes an agent file; it is there whole or not at all.
 
     Args:
         path (str or Path): where to; missing folders are made.
         agent (Agent): what to save.
         config (TrainConfig): the run.
-        counters (dict): e.g. env_steps, decision_steps, updates.
+        counters (mapping): e.g. env_steps, decision_steps, updates.
 
     Returns:
         Path: the file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = {
-        "format": FORMAT,
-        "config": config.to_dict(),
-        "observation_dim": agent.world_model.observation_dim,
-        "action_dim": agent.world_model.action_dim,
-        "world_model": agent.world_model.state_dict(),
-        "loss": agent.loss.state_dict(),  # shares its storage with the world model, so it is written once
-        "updater": agent.updater.state_dict(),
-        "counters": dict(counters),
-    }
-    with replacing(path) as partial:
-        torch.save(content, partial)
+    write_tensors(path, AgentFile(agent, config, lambda: counters).state_dict())
     return path
 
 
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The content of a checkpoint; never runs code from the file (``weights_only=True``).
+def read_agent_file(path: str | Path) -> dict[str, Any]:
+    """The content of an agent file; never runs code from it (``weights_only=True``).
 
     Raises:
-        CheckpointError: if the file is missing, is not a checkpoint or has another format.
+        CheckpointError: if the file is missing, is not an agent file or has another format.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if not path.is_file():
         raise CheckpointError(f"{path} is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt.")
     try:
@@ -79,13 +94,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def load_state(agent: Agent, content: dict[str, Any]) -> None:
-    """Gives an agent the weights, targets, running scale and optimiser of :func:`read_checkpoint`."""
-    agent.world_model.load_state_dict(content["world_model"])
-    agent.loss.load_state_dict(content["loss"])
-    agent.updater.load_state_dict(content["updater"])
-
-
 def load_agent(
     path: str | Path,
     *,
@@ -94,10 +102,12 @@ def load_agent(
     device: torch.device | str = "cpu",
     compile_setting: str | None = None,
 ) -> tuple[Agent, TrainConfig, dict[str, int | float]]:
-    """Rebuilds the agent of a checkpoint.
+    """Rebuilds the agent of a file.
 
     Args:
-        path (str or Path): the checkpoint.
+        path (str or Path): the file.
+
+    Keyword Args:
         observation_dim (int, optional): O of the environment it is meant for; checked if given.
         action_dim (int, optional): A of that environment; checked if given.
         device (torch.device or str): where the networks go. Default: ``"cpu"``.
@@ -109,7 +119,7 @@ def load_agent(
     Raises:
         CheckpointError: if the file cannot be used, or the sizes differ.
     """
-    content = read_checkpoint(path)
+    content = read_agent_file(path)
     saved = (content["observation_dim"], content["action_dim"])
     wanted = (observation_dim or saved[0], action_dim or saved[1])
     if saved != wanted:
@@ -123,7 +133,7 @@ def load_agent(
     try:
         config = TrainConfig.from_dict(values)
         agent = build_agent(config, *saved, device=device)
-        load_state(agent, content)
+        agent.load_state_dict(content)
     except (RuntimeError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:160]
         raise CheckpointError(f"{path} does not fit its own configuration ({reason}).") from error

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import os
 import secrets
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,15 +13,10 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_etdmpc.replay.reanalyze import TARGETS
-
-__all__ = ["DamagedFileError", "ReplayJournal", "read_checked", "write_checked"]
+from torchrl_etdmpc.runs.files import read_tensors, remove_partial_files, write_tensors
 
 ROWS_PER_FILE = 16_384
 PARTS = 3
-
-
-class DamagedFileError(RuntimeError):
-    """A file of a checkpoint that is missing or is not what was written."""
 
 
 class ReplayJournal:
@@ -131,7 +123,7 @@ class ReplayJournal:
     def _write(self, name: str, content: TensorDictBase) -> dict[str, Any]:
         # A run that goes on from an older state must not meet the files of the future that it lost.
         file = f"{name}-{secrets.token_hex(4)}.pt"
-        return {"file": file, "sha256": write_checked(self.folder / file, content.cpu().to_dict())}
+        return {"file": file, "sha256": write_tensors(self.folder / file, content.cpu().to_dict())}
 
     def load(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> None:
         """Fills an empty buffer, and goes on from there at the next :meth:`save`.
@@ -178,7 +170,7 @@ class ReplayJournal:
         self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
 
     def _read(self, entry: Mapping[str, Any]) -> TensorDict:
-        content = read_checked(self.folder / entry["file"], entry["sha256"])
+        content = read_tensors(self.folder / entry["file"], entry["sha256"])
         return TensorDict(content, [len(next(iter(_leaves(content))))])
 
     def prune(self, kept: Iterable[Mapping[str, Any]]) -> None:
@@ -188,43 +180,10 @@ class ReplayJournal:
             kept (iterable of mapping): what :meth:`save` returned, for every state that should stay loadable.
         """
         named = {entry["file"] for files in kept for part in ("rows", "targets") for entry in files[part]}
+        remove_partial_files(self.folder)
         for file in self.folder.glob("*.pt"):
             if file.name not in named:
                 file.unlink(missing_ok=True)
-
-
-def write_checked(path: Path, content: Any) -> str:
-    """Writes tensors and plain containers, safe against a power cut; returns the file's SHA-256."""
-    memory = io.BytesIO()
-    torch.save(content, memory)
-    data = memory.getbuffer()
-    try:
-        with path.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError:
-        path.unlink(missing_ok=True)
-        raise
-    return hashlib.sha256(data).hexdigest()
-
-
-def read_checked(path: Path, sha256: str) -> Any:
-    """Reads a file of :func:`write_checked` without running any code in it.
-
-    Raises:
-        DamagedFileError: if it is missing, has changed or holds something else.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DamagedFileError(f"{path} cannot be read ({error.strerror}).") from error
-    if hashlib.sha256(data).hexdigest() != sha256:
-        raise DamagedFileError(f"{path} is not the file that was written: it is cut off or damaged.")
-    try:
-        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # the errors of hostile files advise to run their code
-        raise DamagedFileError(f"{path} holds more than tensors and plain containers; it was not loaded.") from error
 
 
 def _leaves(content: Mapping[str, Any]) -> Iterable[Tensor]:

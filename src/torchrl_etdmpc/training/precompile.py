@@ -12,12 +12,13 @@ from torchrl import torchrl_logger
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_etdmpc.training.builders import Agent
+from torchrl_etdmpc.runs import first_line
+from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig
 
 
-def warm_up(
-    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int], *, device: torch.device
+def precompile(
+    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]
 ) -> float:
     """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
 
@@ -29,16 +30,13 @@ def warm_up(
         batch (sequence of int): batch size of the training environment.
         eval_batch (sequence of int): batch size of the evaluation environment.
 
-    Keyword Args:
-        device (torch.device): of the agent.
-
     Returns:
         float: seconds that it took; 0 if nothing is compiled.
     """
     if agent.compile_mode is None:
         return 0.0
     torchrl_logger.info("compiling, which takes minutes the first time and seconds from PyTorch's cache later")
-    tick = time.perf_counter()
+    tick, device = time.perf_counter(), agent.device
     calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
     try:
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -48,8 +46,7 @@ def warm_up(
         if config.compile != "auto":
             raise
         agent.make_eager()
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        warnings.warn(f"cannot compile here, so training is slower: {reason}", stacklevel=3)
+        warnings.warn(f"cannot compile here, so training is slower: {first_line(error)}", stacklevel=3)
     seconds = time.perf_counter() - tick
     torchrl_logger.info(f"compiled in {seconds:.0f} s")
     return seconds

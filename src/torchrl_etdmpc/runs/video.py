@@ -4,41 +4,42 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-__all__ = ["write_mp4"]
+from torchrl_etdmpc.runs.files import replacing
 
 
 def write_mp4(
     frames: torch.Tensor | np.ndarray | Iterable[torch.Tensor | np.ndarray], path: str | os.PathLike[str], fps: float
 ) -> Path:
-    """Write an H.264 video that browsers play.
+    """Writes an H.264 video that browsers play.
 
-    An odd height or width loses its last row or column, because the format needs even ones. The video is
-    written under a temporary name and moved into place, so ``path`` never holds half a video.
+    An odd height or width loses its last row or column, because the format needs even ones. The file is there whole or
+    not at all.
 
     Args:
-        frames: uint8 RGB, ``[T, H, W, 3]``, or an iterable of ``[H, W, 3]`` frames (one at a time in memory).
-        path: the file, ending in ``.mp4``; its directory is made; an existing file is replaced.
-        fps: frames per second, above 0. For real time: 1 / (seconds between two frames).
+        frames (Tensor or ndarray or iterable): uint8 RGB, ``[T, H, W, 3]``, or an iterable of ``[H, W, 3]`` frames (one
+            at a time in memory).
+        path (str or Path): the file, ending in ``.mp4``; its directory is made; an existing file is replaced.
+        fps (float): frames per second, above 0. For real time: 1 / (seconds between two frames).
 
     Returns:
-        ``path`` as a :class:`~pathlib.Path`.
+        Path: the file.
 
     Raises:
-        ImportError: imageio-ffmpeg is not installed.
+        ImportError: if imageio-ffmpeg is not installed.
         ValueError: no frames, frames of another shape or dtype, ``fps`` not above 0, or another suffix.
-        OSError: ``path`` cannot be written, or ffmpeg failed.
+        OSError: if ``path`` cannot be written, or ffmpeg failed.
 
-    Examples:
-        >>> import tempfile
-        >>> frames = torch.zeros(5, 32, 48, 3, dtype=torch.uint8)
-        >>> write_mp4(frames, Path(tempfile.mkdtemp()) / "episode.mp4", fps=25).name
-        'episode.mp4'
+    >>> import tempfile
+    >>> frames = torch.zeros(5, 32, 48, 3, dtype=torch.uint8)
+    >>> write_mp4(frames, Path(tempfile.mkdtemp()) / "episode.mp4", fps=25).name
+    'episode.mp4'
     """
     path = Path(path).expanduser()
     if path.suffix != ".mp4":
@@ -58,30 +59,33 @@ def write_mp4(
         raise ValueError("frames must hold at least one frame, got none; record an episode first.")
     first = _check_frame(first, 0, None)
     height, width = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.mp4")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.touch()
+        with replacing(path) as partial:
+            partial.touch()  # ffmpeg's own error would not name the reason
+            # Even sizes need no further alignment; a larger block would make ffmpeg rescale the picture.
+            writer = imageio_ffmpeg.write_frames(str(partial), (width, height), fps=float(fps), macro_block_size=2)
+            count = _send_all(writer, chain([first], iterator), height, width)
+            _check_video(imageio_ffmpeg, partial, count)
     except OSError as error:
+        if error.errno is None:  # ours, of ffmpeg
+            raise
         raise OSError(f"path={path} cannot be written ({error.strerror}); choose another path.") from error
-    try:
-        count = 1
-        # Even sizes need no further alignment; a larger block would make ffmpeg rescale the picture.
-        writer = imageio_ffmpeg.write_frames(str(partial), (width, height), fps=float(fps), macro_block_size=2)
-        try:
-            writer.send(None)
-            _send(writer, first[:height, :width])
-            for frame in iterator:
-                frame = _check_frame(frame, count, first.shape)
-                _send(writer, frame[:height, :width])
-                count += 1
-        finally:
-            writer.close()
-        _check_video(imageio_ffmpeg, partial, count)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
+
+
+def _send_all(writer: Any, frames: Iterable[Any], height: int, width: int) -> int:
+    shape, count = None, 0
+    try:
+        writer.send(None)
+        for frame in frames:
+            array = _check_frame(frame, count, shape)
+            shape = array.shape
+            _send(writer, array[:height, :width])
+            count += 1
+    finally:
+        writer.close()
+    return count
 
 
 def _check_frame(frame: Any, index: int, shape: tuple[int, ...] | None) -> np.ndarray:

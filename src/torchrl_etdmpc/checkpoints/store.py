@@ -1,0 +1,191 @@
+"""The checkpoints of one run: each is whole or not there, and shares the files of the buffer with the others.
+
+==========================  ================================================================================
+``resume/<step>/``          one file for each part, and ``manifest.json``, which names every file with its
+                            checksum
+``replay/``                 the buffer, see :class:`~torchrl_etdmpc.checkpoints.ReplayJournal`
+==========================  ================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_etdmpc.checkpoints.journal import ReplayJournal
+from torchrl_etdmpc.runs.files import (
+    DamagedFileError,
+    link,
+    read_tensors,
+    remove_partial_files,
+    sync,
+    write_tensors,
+    write_whole,
+)
+
+FORMAT = 3
+
+
+class CheckpointError(RuntimeError):
+    """A file that cannot be used as a checkpoint, and why."""
+
+
+class Part(Protocol):
+    """Anything that owns a state."""
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """Tensors and plain containers."""
+        ...
+
+    def load_state_dict(self, state_dict: Any) -> Any:
+        """Goes back to where :meth:`state_dict` was called."""
+        ...
+
+
+class CheckpointStore:
+    """Saves and restores named parts and one buffer under ``folder``.
+
+    Args:
+        folder (str or Path): made if missing.
+
+    Keyword Args:
+        keep (int): checkpoints that are kept; if the newest is damaged, the one before serves. Default: 2.
+
+    >>> import tempfile, torch
+    >>> from torchrl.data import LazyTensorStorage
+    >>> layer, buffer = torch.nn.Linear(2, 1), TensorDictReplayBuffer(storage=LazyTensorStorage(10))
+    >>> store = CheckpointStore(tempfile.mkdtemp())
+    >>> _ = store.save(100, {"layer": layer}, buffer)
+    >>> store.load({"layer": torch.nn.Linear(2, 1)}, buffer).name
+    '000000000100'
+    """
+
+    def __init__(self, folder: str | Path, *, keep: int = 2) -> None:
+        if keep < 1:
+            raise ValueError(f"keep must be at least 1, got {keep}.")
+        self.folder = Path(folder)
+        self.keep = keep
+        self.journal = ReplayJournal(self.folder / "replay")
+
+    def save(
+        self,
+        step: int,
+        parts: Mapping[str, Part],
+        buffer: TensorDictReplayBuffer,
+        *,
+        version: int = 0,
+        links: Mapping[Path, str] | None = None,
+    ) -> Path:
+        """Writes a checkpoint; what was saved before stays usable until the new one is in place.
+
+        Args:
+            step (int): names the checkpoint; the highest is the newest.
+            parts (mapping): name to owner of a state; a name is a file name.
+            buffer (TensorDictReplayBuffer): the same one at every call.
+
+        Keyword Args:
+            version (int): of the model; see :meth:`ReplayJournal.save`. Default: 0.
+            links (mapping, optional): path to the name of the part whose file it becomes, e.g. ``last.pt`` the agent's.
+
+        Returns:
+            Path: the checkpoint's folder.
+
+        Raises:
+            OSError: if it cannot be written; nothing is left of the attempt.
+        """
+        target = self.folder / "resume" / f"{step:012d}"
+        partial = target.with_name(f".{target.name}.partial")
+        before = self.journal.state
+        try:
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            replay = self.journal.save(buffer, version=version)
+            files = {name: write_tensors(partial / f"{name}.pt", dict(part.state_dict())) for name, part in parts.items()}
+            write_whole(partial / "manifest.json", json.dumps({"format": FORMAT, "files": files, "replay": replay}))
+            for path, name in (links or {}).items():  # before the checkpoint: its parts may say that this was done
+                link(partial / f"{name}.pt", path)
+            if target.exists():  # the same step again, e.g. in pretraining
+                os.replace(target, target.with_name(f".{target.name}.old"))
+            os.replace(partial, target)
+            sync(target.parent)
+        except BaseException:
+            self.journal.state = before  # its new files belong to nothing, and the next save must write those rows
+            shutil.rmtree(partial, ignore_errors=True)
+            self._prune()
+            raise
+        self._prune()
+        return target
+
+    def load(self, parts: Mapping[str, Part], buffer: TensorDictReplayBuffer) -> Path:
+        """Restores the buffer, then the parts in their order, from the newest checkpoint that is whole.
+
+        Returns:
+            Path: the checkpoint's folder.
+
+        Raises:
+            CheckpointError: if there is none; its text says what is wrong with each.
+        """
+        faults = []
+        for folder in reversed(self._folders()):
+            try:
+                manifest = _read_manifest(folder)
+                missing = sorted(parts.keys() - manifest["files"].keys())
+                if missing:
+                    raise CheckpointError(f"{folder} lacks {', '.join(missing)}")
+                states = {name: read_tensors(folder / f"{name}.pt", manifest["files"][name]) for name in parts}
+                self.journal.load(buffer, manifest["replay"])
+            except (DamagedFileError, CheckpointError, KeyError, OSError) as error:
+                faults.append(str(error) if str(error) else type(error).__name__)
+                continue
+            for name, part in parts.items():
+                part.load_state_dict(states[name])
+            for fault in faults:
+                warnings.warn(f"going on from {folder}, because {fault}", stacklevel=2)
+            return folder
+        reason = "; ".join(faults) or f"there is no checkpoint under {self.folder}"
+        raise CheckpointError(f"cannot resume: {reason.rstrip('.')}.")
+
+    def exists(self) -> bool:
+        """Whether there is something to go on from. Changes nothing: another process may be training here."""
+        return any((self.folder / "resume").glob("[0-9]*")) or any((self.folder / "resume").glob(".*.old"))
+
+    def _folders(self) -> list[Path]:
+        for old in (self.folder / "resume").glob(".*.old"):  # moved aside for one of the same step
+            target = old.with_name(old.name[1:].removesuffix(".old"))
+            if target.exists():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                os.replace(old, target)
+        return sorted((self.folder / "resume").glob("[0-9]*"))
+
+    def _prune(self) -> None:
+        """Removes old checkpoints, and the replay files that no checkpoint needs."""
+        folders = self._folders()
+        for folder in [*folders[: -self.keep], *(self.folder / "resume").glob(".*.partial")]:
+            shutil.rmtree(folder, ignore_errors=True)
+        remove_partial_files(self.folder)
+        kept = []
+        for folder in folders[-self.keep :]:
+            try:
+                kept.append(_read_manifest(folder)["replay"])
+            except (CheckpointError, KeyError):
+                return  # better too many files than too few
+        self.journal.prune(kept)
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        number = manifest["format"]
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise CheckpointError(f"{folder}/manifest.json is missing or damaged") from error
+    if number != FORMAT:
+        raise CheckpointError(f"{folder} has checkpoint format {number}; this version resumes from {FORMAT}")
+    return manifest

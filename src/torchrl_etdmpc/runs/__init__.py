@@ -1,0 +1,26 @@
+"""A run directory: its files, its tables, its progress. Knows nothing of learning."""
+
+from torchrl_etdmpc.runs.directory import RunDirectory
+from torchrl_etdmpc.runs.errors import first_line
+from torchrl_etdmpc.runs.files import DamagedFileError
+from torchrl_etdmpc.runs.log import COUNTER_COLUMNS, EVAL_COLUMNS, RunLog
+from torchrl_etdmpc.runs.loggers import LoggerName, make_logger, require_logger
+from torchrl_etdmpc.runs.progress_bar import ProgressBar, progress_bar
+from torchrl_etdmpc.runs.versions import library_versions
+from torchrl_etdmpc.runs.video import write_mp4
+
+__all__ = [
+    "COUNTER_COLUMNS",
+    "EVAL_COLUMNS",
+    "DamagedFileError",
+    "LoggerName",
+    "ProgressBar",
+    "RunDirectory",
+    "RunLog",
+    "first_line",
+    "library_versions",
+    "make_logger",
+    "progress_bar",
+    "require_logger",
+    "write_mp4",
+]

@@ -1,0 +1,143 @@
+"""The agent: the parts that learn and act, and how a configuration makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from torchrl_etdmpc.functional import discount_from_episode_length
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc.training.compilation import compile_call, resolve_compile
+from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig, arguments, named_settings
+from torchrl_etdmpc.training.updater import Updater
+
+
+@dataclass(frozen=True)
+class Agent:
+    """The parts that learn and act; all of them share one world model."""
+
+    world_model: WorldModel
+    planner: EnsembleMPPIPlanner
+    eval_planner: EnsembleMPPIPlanner
+    reanalyze_planner: EnsembleMPPIPlanner
+    loss: EfficientTDMPCLoss
+    updater: Updater
+    compile_mode: str | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks live."""
+        return self.world_model.version.device
+
+    def make_eager(self) -> None:
+        """Gives up compilation."""
+        for planner in (self.planner, self.eval_planner, self.reanalyze_planner):
+            planner.compiled_plan = None
+        self.updater.make_eager()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, target weights, running scale, and the optimiser's state."""
+        # The loss shares its storage with the world model, so a file holds the weights once.
+        parts = {"world_model": self.world_model, "loss": self.loss, "updater": self.updater}
+        return {name: part.state_dict() for name, part in parts.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores :meth:`state_dict`."""
+        self.world_model.load_state_dict(state_dict["world_model"])
+        self.loss.load_state_dict(state_dict["loss"])
+        self.updater.load_state_dict(state_dict["updater"])
+
+
+def build_world_model(
+    config: ModelConfig, observation_dim: int, action_dim: int, *, terminates: bool = False
+) -> WorldModel:
+    """The networks for an environment's sizes.
+
+    Args:
+        config (ModelConfig): the group.
+        observation_dim (int): O.
+        action_dim (int): A.
+
+    Keyword Args:
+        terminates (bool): whether the task's episodes can end before their time limit. Default: ``False``.
+    """
+    termination = terminates if config.termination is None else config.termination
+    with named_settings("model", config):
+        return WorldModel(observation_dim, action_dim, termination=termination, **arguments(config, "termination"))
+
+
+def build_planner(
+    world_model: WorldModel,
+    config: PlannerConfig,
+    *,
+    discount: float,
+    warm_start: bool,
+    compile_mode: str | None = None,
+    group: str = "planner",
+) -> EnsembleMPPIPlanner:
+    """A planner on shared networks; ``compile_mode`` compiles its plans.
+
+    Args:
+        world_model (WorldModel): the networks.
+        config (PlannerConfig): the group.
+
+    Keyword Args:
+        discount (float): gamma.
+        warm_start (bool): whether to carry the plan from step to step.
+        compile_mode (str, optional): of ``torch.compile``. Default: ``None``, eager.
+        group (str): the group's name, for messages. Default: ``"planner"``.
+    """
+    schedule = ("every", "num_slices") if group == "reanalyze" else ()  # of ReanalyzeTransform
+    with named_settings(group, config):
+        planner = EnsembleMPPIPlanner(
+            LatentEnv(world_model), discount=discount, warm_start=warm_start, **arguments(config, *schedule)
+        )
+    if compile_mode is not None:
+        planner.compiled_plan = compile_call(planner.plan, compile_mode)
+    return planner
+
+
+def build_agent(
+    config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+) -> Agent:
+    """World model, planners, loss and updater.
+
+    Args:
+        config (TrainConfig): the run.
+        observation_dim (int): O.
+        action_dim (int): A.
+        device (torch.device or str): where the networks live. Default: ``"cpu"``.
+
+    Raises:
+        ValueError: if a setting is out of range; the text begins with its name.
+    """
+    device, task = torch.device(device), config.task_spec
+    compile_mode = resolve_compile(config.compile, device)
+    discount = config.loss.discount
+    if discount is None:
+        discount = discount_from_episode_length(task.decision_steps_per_episode)
+    world_model = build_world_model(config.model, observation_dim, action_dim, terminates=task.terminates).to(device)
+    with named_settings("loss", config.loss):
+        loss = EfficientTDMPCLoss(
+            world_model,
+            discount=discount,
+            scale_tau=config.loss.tau,
+            ignore_termination=config.model.termination is False,
+            **arguments(config.loss, "slice_len", "tau", "discount"),
+        )
+    with named_settings("optim", config.optim):
+        optim = arguments(config.optim, "batch_size", "updates_per_decision")
+        updater = Updater(loss, tau=config.loss.tau, compile_mode=compile_mode, **optim)
+    common = {"discount": discount, "compile_mode": compile_mode}
+    planner, eval_planner = (
+        build_planner(world_model, config.planner, warm_start=True, **common) for _ in range(2)
+    )
+    reanalyze_planner = build_planner(
+        world_model, config.reanalyze, warm_start=False, group="reanalyze", **common
+    )
+    return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater, compile_mode)

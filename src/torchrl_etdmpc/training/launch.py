@@ -1,0 +1,182 @@
+"""From a command to a run: which directory, new or gone on with, and what may change on the way."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from torchrl_etdmpc.checkpoints import CheckpointStore
+from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
+from torchrl_etdmpc.training.builders import resolve_device
+from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.train import TrainingRun
+
+CHANGEABLE = {
+    "resume",
+    "run_dir",
+    "total_env_steps",
+    "device",
+    "threads",
+    "compile",
+    "logger",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "checkpoint_keep",
+}
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What a command comes to.
+
+    Attributes:
+        config (TrainConfig): the command's, or the stored one with what the command changes.
+        directory (RunDirectory): of the run.
+        action (str): ``"begin"`` a new run; ``"resume"`` from the newest checkpoint; ``"start over"`` a run that ended
+            before its first one; ``"nothing"`` to do, it is finished.
+    """
+
+    config: TrainConfig
+    directory: RunDirectory
+    action: Literal["begin", "resume", "start over", "nothing"]
+
+
+def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
+    """Decides what a command does, by what is in its run directory. Changes nothing.
+
+    Args:
+        config (TrainConfig): of the command.
+        explicit (iterable of str): settings that the command names, e.g. ``planner.horizon``.
+
+    Raises:
+        FileExistsError: if the directory holds a run and ``resume`` is off.
+        FileNotFoundError: if there is no run to go on with and ``resume`` is on.
+        ValueError: if the command names a setting with another value than the run's, and it may not change.
+    """
+    name = config.task.replace(":", ".")
+    directory = RunDirectory(config.run_dir or Path("runs", name, config.preset, f"seed{config.seed}"))
+    saved = CheckpointStore(directory.checkpoints).exists()
+    if config.resume == "off" or (config.resume == "auto" and not saved and not directory.config.exists()):
+        directory.require_new()
+        return Launch(config, directory, "begin")
+    stored = read_run_config(directory)
+    merged = resumed_config(stored, config, explicit)
+    if directory.finished and merged.total_env_steps <= stored.total_env_steps:
+        return Launch(merged, directory, "nothing")
+    return Launch(merged, directory, "resume" if saved or config.resume == "on" else "start over")
+
+
+def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
+    """Trains, from an empty directory or from where the run was stopped, to ``summary.json``.
+
+    Sets the number of threads, the precision of matrix products and the random numbers of this process.
+
+    Args:
+        config (TrainConfig): of the command.
+        explicit (iterable of str): settings that the command names, e.g. ``planner.horizon``.
+
+    Returns:
+        str: one line on what came out.
+
+    Raises:
+        RunInterrupted: if a signal asked the run to stop; it is saved.
+        ValueError, OSError, RuntimeError: if something is wrong with the command or its directory; nothing is left
+            behind.
+    """
+    plan = plan_launch(config, explicit)
+    config, directory = plan.config, plan.directory
+    if plan.action == "nothing":
+        return f"{directory} is finished; nothing to do"
+    require_logger(config.logger)
+    resolve_device(config.device)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    torch.set_float32_matmul_precision("high")
+    torch.manual_seed(config.seed)
+    with contextlib.ExitStack() as stack:
+        env = make_env(config.task_spec, seed=config.seed, num_envs=config.num_envs)
+        stack.callback(env.close, raise_if_closed=False)
+        eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)
+        stack.callback(eval_env.close, raise_if_closed=False)
+        log = RunLog(directory, total_env_steps=config.total_env_steps)
+        run = TrainingRun(config, env=env, eval_env=eval_env, log=log)  # before the directory: settings may be wrong
+        (directory.begin if plan.action == "begin" else directory.go_on)(config.to_dict())
+        stack.callback(directory.close)
+        stack.callback(log.close)
+        try:
+            log.logger = make_logger(config.logger, directory, config.to_dict())
+        except BaseException:
+            if plan.action == "begin":
+                directory.abandon()
+            raise
+        if plan.action == "resume":
+            run.resume()
+        elif plan.action == "start over":
+            log.start_over()
+        summary = run.run()
+    return (
+        f"{config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
+        f"{summary['wall_time_s']:.0f} s; curve, tables and checkpoint are in {directory}"
+    )
+
+
+def read_run_config(directory: RunDirectory) -> TrainConfig:
+    """The configuration in a run directory.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is not a configuration of this version.
+    """
+    values = directory.read_config()
+    try:
+        return TrainConfig.from_dict(values)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{directory.config} is not a configuration of this version: {error}") from error
+
+
+def resumed_config(saved: TrainConfig, asked: TrainConfig, explicit: Iterable[str]) -> TrainConfig:
+    """The saved configuration with the settings that may change.
+
+    Args:
+        saved (TrainConfig): of the run directory.
+        asked (TrainConfig): of this command.
+        explicit (iterable of str): settings that the command names, e.g. ``planner.horizon``; the others are taken
+            from the run.
+
+    Raises:
+        ValueError: if the command names a setting with another value than the run's, and it may not change.
+    """
+    values, wanted = _flat(saved.to_dict()), _flat(asked.to_dict())
+    for name in explicit:
+        if name in CHANGEABLE:
+            values[name] = wanted[name]
+        elif values[name] != wanted[name]:
+            raise ValueError(
+                f"{name}={wanted[name]} was asked for, but this run was started with {name}={values[name]}; leave it "
+                "out to go on, or start a new run_dir."
+            )
+    return TrainConfig.from_dict(_nested(values))
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _nested(values: dict[str, Any]) -> dict[str, Any]:
+    nested: dict[str, Any] = {}
+    for name, value in values.items():
+        *groups, last = name.split(".")
+        target = nested
+        for group in groups:
+            target = target.setdefault(group, {})
+        target[last] = value
+    return nested

@@ -1,0 +1,171 @@
+"""The learner: decisions of the environments, and the gradient steps that they call for."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl import torchrl_logger
+from torchrl.envs import EnvBase
+
+from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.training.agent import build_agent
+from torchrl_etdmpc.training.builders import (
+    build_collector,
+    build_reanalyze,
+    build_replay,
+    resolve_device,
+    row_bytes,
+)
+from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.interval_means import IntervalMeans
+
+
+class Learner:
+    """Agent, buffer, reanalyze and collector of one run, and what they measure between two rows of ``train.csv``.
+
+    Args:
+        config (TrainConfig): the run.
+        env (EnvBase): batch size [] or [config.num_envs].
+
+    Attributes:
+        pretrained (int): updates of the pretraining so far.
+        faults (int): failures of simulator or policy so far.
+        faults_in_a_row (int): without a finished episode in between.
+
+    Raises:
+        ValueError: if a setting is out of range.
+    """
+
+    def __init__(self, config: TrainConfig, env: EnvBase) -> None:
+        self.config = config
+        device = resolve_device(config.device)
+        sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+        self.agent = build_agent(config, *sizes, device)
+        self.replay = build_replay(config, device, sizes=sizes)
+        rows, where = self.replay.storage.max_size, self.replay.storage.device
+        torchrl_logger.info(f"replay: {rows:,} rows, {rows * row_bytes(*sizes) / 1e6:,.0f} MB when full, on {where}")
+        self.reanalyze = build_reanalyze(config, self.agent, self.replay)
+        self.collector = build_collector(config, self.agent, env, self.replay)
+        self.pretrained = self.faults = self.faults_in_a_row = 0
+        self._updates, self._decisions = IntervalMeans(), IntervalMeans()
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps so far, action repeats counted."""
+        return self.collector.frames * self.config.task_spec.action_repeat
+
+    def passed(self, interval: int) -> bool:
+        """Whether the last step of all environments passed a multiple of ``interval`` environment steps."""
+        before = self.env_steps - self.config.num_envs * self.config.task_spec.action_repeat
+        return self.env_steps // interval > before // interval
+
+    def step(self, *, updates: bool = False) -> bool:
+        """One decision of every environment, and with ``updates`` those that it calls for.
+
+        Returns:
+            bool: whether it was made. A simulator that fails costs its episode, and counts.
+        """
+        overlap = updates and self.config.overlap
+        try:
+            acted = self.collector.act()
+            if overlap:
+                self.updates()  # queued on a device, they run while the simulator steps
+            stepped = self.collector.finish_step(acted)
+        except (NonFiniteError, SimulatorError) as error:
+            self._count_fault(error)
+            return False
+        self._note_episodes(stepped)
+        if updates:
+            self._decisions.add({"plan_fallbacks": stepped["plan", "fallback"].float().mean()})
+        if updates and not overlap:
+            self.updates()
+        return True
+
+    def _note_episodes(self, stepped: TensorDictBase) -> None:
+        done = stepped["next", "done"]
+        if not done.any():
+            return
+        self.faults_in_a_row = 0
+        for episode_return in stepped["next", "episode_reward"][done].unbind():
+            self._decisions.add({"episode_return": episode_return})
+        if stepped["next", "terminated"].any() and not self.config.task_spec.terminates:
+            raise ValueError(
+                f"an episode of {self.config.task} terminated, but the task is said never to; "
+                "say task.terminates=true (model.termination=false to bootstrap through its ends)."
+            )
+
+    def _count_fault(self, error: NonFiniteError | SimulatorError) -> None:
+        self.faults += 1
+        self.faults_in_a_row += 1
+        if self.faults_in_a_row >= self.config.max_faults:
+            raise error
+        warnings.warn(f"{error}; training goes on with a fresh episode (failure {self.faults}).", stacklevel=3)
+
+    def update(self, *, distill: bool = True) -> None:
+        """One gradient step on a fresh sample."""
+        batch = self.replay.sample().to(self.agent.device).reshape(-1, self.config.loss.slice_len)
+        metrics = self.agent.updater.step(batch, distill=distill)
+        if distill:
+            self._updates.add(dict(metrics.items()))
+            if self.reanalyze is not None and self.reanalyze.target_age is not None:
+                self._updates.add({"target_age": self.reanalyze.target_age})
+
+    def updates(self) -> None:
+        """The updates that one decision of every environment calls for."""
+        for _ in range(self.config.optim.updates_per_decision * self.config.num_envs):
+            self.update()
+
+    def pretrain(self) -> Iterator[None]:
+        """Updates of world model and value on the random data, one at a time; it teaches the policy nothing."""
+        if self.reanalyze is not None:
+            self.reanalyze.enabled = False
+        while self.pretrained < self.config.pretrain_updates:
+            self.update(distill=False)
+            self.pretrained += 1
+            yield
+        if self.reanalyze is not None:
+            self.reanalyze.enabled = True
+
+    def pop_row(self) -> dict[str, Any]:
+        """A row of ``train.csv``: means since the last one, and counts since the run began.
+
+        Raises:
+            NonFiniteError: if the last ``max_skipped`` updates were all skipped.
+        """
+        row: dict[str, Any] = self._updates.means()
+        self._check_updates(row)
+        row |= {"episode_return": math.nan} | self._decisions.means()
+        row |= {"simulator_faults": self.faults, "updates_skipped": int(self.agent.updater.skipped)}
+        if self.reanalyze is not None:
+            row.setdefault("target_age", math.nan)
+            row |= {"targets_refreshed": self.reanalyze.refreshed, "targets_stale": self.reanalyze.stale}
+        self._updates.clear()
+        self._decisions.clear()
+        return row
+
+    def _check_updates(self, row: dict[str, float]) -> None:
+        in_a_row = int(self.agent.updater.skipped_in_a_row)
+        if in_a_row < self.config.max_skipped:
+            return
+        broken = [name for name, value in row.items() if name.startswith(("loss_", "grad_")) and not math.isfinite(value)]
+        raise NonFiniteError(
+            f"the last {in_a_row} updates had no finite gradient and were skipped; not finite are {', '.join(broken)}. "
+            "A lower optim.lr or optim.grad_clip_norm may help."
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counts and what was measured since the last row; the parts have states of their own."""
+        names = ("pretrained", "faults", "faults_in_a_row")
+        means = {"updates": self._updates.state_dict(), "decisions": self._decisions.state_dict()}
+        return {name: getattr(self, name) for name in names} | means
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores :meth:`state_dict`."""
+        self.pretrained = state_dict["pretrained"]
+        self.faults, self.faults_in_a_row = state_dict["faults"], state_dict["faults_in_a_row"]
+        self._updates.load_state_dict(state_dict["updates"])
+        self._decisions.load_state_dict(state_dict["decisions"])
