@@ -17,7 +17,8 @@ from pathlib import Path
 
 import torch
 
-from torchrl_etdmpc.training import export_planner, export_policy, hydra_main, load_agent
+from torchrl_etdmpc import export_planner, export_policy
+from torchrl_etdmpc.training import hydra_main, load_agent
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,10 @@ class ExportConfig:
 def main(config: ExportConfig) -> None:
     """Exports, compares with the live agent, writes."""
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
-    policy, planner = export_policy(agent), export_planner(agent, batch_size=config.batch_size)
-    model, horizon = agent.world_model, agent.eval_planner.horizon
+    model = agent.world_model
+    policy = export_policy(model)
+    planner = export_planner(agent.eval_planner, batch_size=config.batch_size)
+    horizon = agent.eval_planner.horizon
     observation = torch.randn(config.batch_size, model.observation_dim)
     plan_mean = torch.zeros(config.batch_size, horizon, model.action_dim)
     with torch.no_grad():

@@ -16,8 +16,7 @@ from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
-
-TRAJ_KEY = ("collector", "traj_ids")
+from torchrl_etdmpc.keys import TRAJECTORY as TRAJ_KEY
 
 Insertion = Literal["step", "episode"]
 

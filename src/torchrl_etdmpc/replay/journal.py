@@ -15,7 +15,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_etdmpc.replay.reanalyze import TARGETS
+from torchrl_etdmpc.keys import TARGETS
 
 __all__ = ["DamagedFileError", "ReplayJournal", "read_checked", "write_checked"]
 

@@ -16,7 +16,6 @@ from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, 
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.curve import plot_curve
 from torchrl_etdmpc.training.evaluate import BarePolicy, evaluate
-from torchrl_etdmpc.training.export import export_planner, export_policy
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.progress import progress_bar
 from torchrl_etdmpc.training.resume import read_run_config, resumed_config
@@ -48,8 +47,6 @@ __all__ = [
     "build_world_model",
     "evaluate",
     "explicit_settings",
-    "export_planner",
-    "export_policy",
     "hydra_main",
     "library_versions",
     "load_agent",

@@ -9,11 +9,10 @@ import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
 
 from torchrl_etdmpc.collectors import SeedPolicy, StepCollector
-from torchrl_etdmpc.envs import LatentEnv
 from torchrl_etdmpc.functional import discount_from_episode_length
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss
-from torchrl_etdmpc.planners import EnsembleMPPIPlanner
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 from torchrl_etdmpc.training.compilation import compile_call, resolve_compile
 from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig
@@ -41,7 +40,7 @@ class Agent:
     def make_eager(self) -> None:
         """Gives up compilation."""
         for planner in (self.planner, self.eval_planner, self.reanalyze_planner):
-            planner.__dict__.pop("plan", None)
+            planner.compiled_plan = None
         self.updater.make_eager()
 
 
@@ -74,9 +73,11 @@ def build_world_model(config: ModelConfig, observation_dim: int, action_dim: int
         num_values=config.num_values,
         simnorm_dim=config.simnorm_dim,
         num_bins=config.num_bins,
-        bin_range=(config.bin_min, config.bin_max),
+        bin_min=config.bin_min,
+        bin_max=config.bin_max,
         dropout=config.dropout,
-        log_std_bounds=(config.log_std_min, config.log_std_max),
+        log_std_min=config.log_std_min,
+        log_std_max=config.log_std_max,
         activation=config.activation,
         termination=config.termination,
     )
@@ -88,7 +89,8 @@ def build_planner(
     *,
     discount: float,
     warm_start: bool,
-    proposal_log_std_bounds: tuple[float, float] | None = None,
+    proposal_log_std_min: float | None = None,
+    proposal_log_std_max: float | None = None,
     compile_mode: str | None = None,
 ) -> EnsembleMPPIPlanner:
     """A planner on shared networks; ``compile_mode`` compiles its ``plan``."""
@@ -110,11 +112,12 @@ def build_planner(
         first_action=config.first_action,
         eval_first_action=config.eval_first_action,
         warm_start=warm_start,
-        scoring_dtype=None if config.scoring_dtype == "float32" else torch.bfloat16,
-        proposal_log_std_bounds=proposal_log_std_bounds,
+        scoring_dtype=config.scoring_dtype,
+        proposal_log_std_min=proposal_log_std_min,
+        proposal_log_std_max=proposal_log_std_max,
     )
     if compile_mode is not None:
-        planner.plan = compile_call(planner.plan, compile_mode)
+        planner.compiled_plan = compile_call(planner.plan, compile_mode)
     return planner
 
 
@@ -164,7 +167,8 @@ def build_agent(
         config.reanalyze,
         discount=discount,
         warm_start=False,
-        proposal_log_std_bounds=(config.reanalyze.proposal_log_std_min, config.reanalyze.proposal_log_std_max),
+        proposal_log_std_min=config.reanalyze.proposal_log_std_min,
+        proposal_log_std_max=config.reanalyze.proposal_log_std_max,
         compile_mode=compile_mode,
     )
     return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater, compile_mode)
