@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from torchrl_etdmpc.planners import export_planner, export_policy
+from torchrl_etdmpc import export_planner, export_policy
 from torchrl_etdmpc.training import hydra_main, load_agent
 
 
@@ -34,9 +34,10 @@ class ExportConfig:
 def main(config: ExportConfig) -> None:
     """Exports, compares with the live agent, writes."""
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
-    policy = export_policy(agent.world_model)
+    model = agent.world_model
+    policy = export_policy(model)
     planner = export_planner(agent.eval_planner, batch_size=config.batch_size)
-    model, horizon = agent.world_model, agent.eval_planner.horizon
+    horizon = agent.eval_planner.horizon
     observation = torch.randn(config.batch_size, model.observation_dim)
     plan_mean = torch.zeros(config.batch_size, horizon, model.action_dim)
     with torch.no_grad():

@@ -57,6 +57,9 @@ def make_model() -> WorldModel:
     return WorldModel(3, 1, latent_dim=32, mlp_dim=32, encoder_dim=32, num_dynamics=2)
 
 
+WIDE = {"proposal_log_std_min": -2.0, "proposal_log_std_max": 1.0}
+
+
 def make_planner(model: WorldModel, **options) -> EnsembleMPPIPlanner:
     return EnsembleMPPIPlanner(
         LatentEnv(model),
@@ -71,7 +74,7 @@ def make_planner(model: WorldModel, **options) -> EnsembleMPPIPlanner:
 
 
 def make_reanalyze(model: WorldModel, buffer: TensorDictReplayBuffer) -> ReanalyzeTransform:
-    planner = make_planner(model, warm_start=False, score="final", proposal_log_std_bounds=(-2.0, 1.0))
+    planner = make_planner(model, warm_start=False, score="final", **WIDE)
     return ReanalyzeTransform(
         planner,
         slice_len=SLICE_LEN,

@@ -7,15 +7,24 @@ candidates, steps, action dimensions".
 """
 
 from torchrl_etdmpc.collectors import NonFiniteError, SeedPolicy, SimulatorError, StepCollector
-from torchrl_etdmpc.envs import LatentEnv
-from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.modules import PredictionModel, WorldModel
 from torchrl_etdmpc.objectives import (
     EfficientTDMPCLoss,
     EfficientTDMPCModelLoss,
     EfficientTDMPCPolicyLoss,
     EfficientTDMPCValueLoss,
 )
-from torchrl_etdmpc.planners import AdaptiveScore, EnsembleMPPIPlanner, FinalScore, MeanScore, Plan, PlanTrace
+from torchrl_etdmpc.planners import (
+    AdaptiveScore,
+    EnsembleMPPIPlanner,
+    FinalScore,
+    LatentEnv,
+    MeanScore,
+    Plan,
+    PlanTrace,
+    export_planner,
+    export_policy,
+)
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 
 __version__ = "0.1.0"
@@ -33,10 +42,13 @@ __all__ = [
     "NonFiniteError",
     "Plan",
     "PlanTrace",
+    "PredictionModel",
     "ReanalyzeTransform",
     "SeedPolicy",
     "SimulatorError",
     "StepCollector",
     "StepSliceSampler",
     "WorldModel",
+    "export_planner",
+    "export_policy",
 ]

@@ -493,7 +493,7 @@ def test_the_planner_is_warm_started_within_episodes_and_the_plan_is_not_stored(
         made.append(plan(observation, plan_mean, **options))
         return made[-1]
 
-    planner.plan = spy
+    planner.compiled_plan = spy
     steps = list(StepCollector(make_env(lengths), planner, replay_buffer=replay, total_frames=24))
     assert not [key for key in replay.storage[:].keys(True, True) if "plan_mean" in key]
     assert not [key for key in steps[0].keys(True, True) if "plan_mean" in key]

@@ -11,15 +11,7 @@ import torch
 
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.training import (  # noqa: E402
-    TrainConfig,
-    build_agent,
-    export_planner,
-    export_policy,
-    load_agent,
-    preset,
-    save_checkpoint,
-)
+from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, preset, save_checkpoint  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT = ("torchrl", "tensordict", "torchrl_etdmpc", "dm_control", "hydra")
@@ -39,34 +31,6 @@ def make_agent():
 def checkpoint(tmp_path_factory) -> Path:
     agent, config = make_agent()
     return save_checkpoint(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 0})
-
-
-@pytest.mark.parametrize("states", [1, 2, 7])
-def test_the_exported_policy_acts_like_the_live_one_for_any_number_of_states(states):
-    agent, _ = make_agent()
-    observation = torch.randn(states, 24)
-    with torch.no_grad():
-        expected, _ = agent.world_model.policy(agent.world_model.encode(observation))
-        torch.testing.assert_close(export_policy(agent).module()(observation), expected)
-
-
-@pytest.mark.parametrize("states", [1, 3])
-def test_the_exported_planner_plans_like_the_live_one_and_draws_new_noise(states):
-    agent, _ = make_agent()
-    program = export_planner(agent, batch_size=states).module()
-    observation, plan_mean = torch.randn(states, 24), torch.randn(states, 3, 6).clamp(-1, 1)
-    torch.manual_seed(1)
-    action, mean = program(observation, plan_mean)
-    torch.manual_seed(1)
-    plan = agent.eval_planner.plan(observation, plan_mean, explore=False)
-    torch.testing.assert_close(action, plan.action)
-    torch.testing.assert_close(mean, plan.mean)
-    assert not torch.equal(program(observation, plan_mean)[1], mean)
-
-
-def test_no_batch_is_refused():
-    with pytest.raises(ValueError, match=r"^batch_size must be at least 1, got 0\.$"):
-        export_planner(make_agent()[0], batch_size=0)
 
 
 def test_the_files_run_in_a_process_that_has_pytorch_only(checkpoint, tmp_path):

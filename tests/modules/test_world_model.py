@@ -398,9 +398,21 @@ def test_a_size_below_one_is_refused_by_name(name, size):
         WorldModel(**{"observation_dim": O, "action_dim": A, name: size})
 
 
-@pytest.mark.parametrize("options", [{"num_bins": 1}, {"bin_range": (3.0, 3.0)}, {"bin_range": (10.0, -10.0)}], ids=str)
-def test_bins_that_do_not_ascend_or_are_fewer_than_two_are_refused(options):
-    with pytest.raises(ValueError, match=r"^num_bins must be at least 2 and bin_range ascending, got num_bins="):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_bins": 1}, r"num_bins must be at least 2, got 1\."),
+        ({"bin_min": 3.0, "bin_max": 3.0}, r"bin_min must be below bin_max=3\.0, got 3\.0\."),
+        ({"bin_min": 10.5}, r"bin_min must be below bin_max=10\.0, got 10\.5\."),
+        ({"log_std_min": 1.0}, r"log_std_min must be below log_std_max=1\.0, got 1\.0\."),
+        ({"log_std_max": -4.0}, r"log_std_min must be below log_std_max=-4\.0, got -3\.0\."),
+        ({"dropout": 1.0}, r"dropout must be in \[0, 1\), got 1\.0\."),
+        ({"dropout": -0.1}, r"dropout must be in \[0, 1\), got -0\.1\."),
+    ],
+    ids=str,
+)
+def test_bins_bounds_and_rates_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=rf"^{message}$"):
         build(**options)
 
 
@@ -423,7 +435,7 @@ def test_the_activation_reaches_every_network():
 
 
 def test_a_state_dict_carries_everything():
-    model, other = randomised(termination=True), build(termination=True, bin_range=(-5.0, 5.0))
+    model, other = randomised(termination=True), build(termination=True, bin_min=-5.0, bin_max=5.0)
     model.version.fill_(41)
     result = other.load_state_dict(model.state_dict())
     assert not result.missing_keys
@@ -535,6 +547,6 @@ def test_the_networks_work_outside_a_world_model():
     latent = simnorm(torch.randn(7, L))
     assert DynamicsEnsemble(L, A, num_heads=3, hidden_dim=8)(latent.unsqueeze(0), torch.rand(7, A)).shape == (3, 7, L)
     assert ValueEnsemble(L, num_heads=3, num_bins=21, hidden_dim=8)(latent).shape == (3, 7, 21)
-    mean, log_std = GaussianPolicy(L, A, hidden_dim=8, log_std_bounds=(0.0, 0.5))(latent)
+    mean, log_std = GaussianPolicy(L, A, hidden_dim=8, log_std_min=0.0, log_std_max=0.5)(latent)
     assert ((log_std > 0) & (log_std < 0.5)).all()
     assert mean.shape == (7, A)

@@ -71,6 +71,8 @@ def make_loss(make_world_model: Callable[..., WorldModel]) -> Callable[..., Loss
         has_targets = kind in ("whole", "value")
         if has_targets:
             options = {"discount": 0.9, **options}
+        if kind != "policy":
+            options = {"ignore_termination": True, **options}  # the flags of make_slices are random
         loss = LOSSES[kind](make_world_model() if world_model is None else world_model, **options)
         if has_targets and updater:
             SoftUpdate(loss, tau=0.01)

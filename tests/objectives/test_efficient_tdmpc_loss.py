@@ -643,7 +643,7 @@ def test_a_missing_key_is_named_together_with_the_way_to_rename_it(make_loss, sl
             "whole model value policy",
             "reduction",
             "average",
-            "reduction must be 'none', 'mean' or 'sum', got 'average'",
+            "reduction must be one of none, mean, sum, got 'average'",
         ),
         ("whole model value policy", "rho", 0.0, r"rho must be in \(0, 1\], got 0.0"),
         ("whole model value policy", "rho", 1.1, r"rho must be in \(0, 1\], got 1.1"),
@@ -652,7 +652,7 @@ def test_a_missing_key_is_named_together_with_the_way_to_rename_it(make_loss, sl
         ("whole value", "discount", 1.1, r"discount must be in \(0, 1\], got 1.1"),
         ("whole policy", "scale_tau", -0.1, r"scale_tau must be in \[0, 1\], got -0.1"),
         ("whole policy", "scale_tau", 1.1, r"scale_tau must be in \[0, 1\], got 1.1"),
-        ("whole policy", "kl_direction", "up", "kl_direction must be 'backward' or 'forward', got 'up'"),
+        ("whole policy", "kl_direction", "up", "kl_direction must be one of backward, forward, got 'up'"),
     ],
 )
 def test_an_option_out_of_range_is_refused_by_name(make_loss, kinds, option, value, message):

@@ -122,9 +122,27 @@ def test_a_callable_is_its_own_score():
     def own(returns):
         return returns[..., 0, 0, 0]
 
-    assert make_score(own) is own
-    score = MeanScore(3.0)
-    assert make_score(score) is score
+    returns = table(3)
+    score = make_score(own)
+    assert score.depths == "all"
+    assert torch.equal(score(returns), own(returns))
+    own.depths = "last"
+    for score in (own, MeanScore(3.0)):
+        assert make_score(score) is score
+
+
+def test_a_score_with_weights_of_its_own_keeps_them_in_sight():
+    weighted = torch.nn.Linear(2, 1)
+    assert set(make_score(weighted).parameters()) == set(weighted.parameters())
+
+
+def test_depths_that_no_planner_knows_are_refused():
+    def own(returns):
+        return returns[..., 0, 0, 0]
+
+    own.depths = "first"
+    with pytest.raises(ValueError, match=r"^depths of a score must be one of last, all, got 'first'\.$"):
+        make_score(own)
 
 
 def test_a_score_cannot_be_changed():
@@ -146,6 +164,8 @@ def test_a_penalty_beside_a_callable_is_refused():
 
 def test_adaptive_refuses_optimism():
     with pytest.raises(
-        ValueError, match=r"^the adaptive score needs beta >= 0, got -1\.0; use 'final' or 'mean' for optimism\.$"
+        ValueError,
+        match=r"^beta must not be negative with the adaptive score, got -1\.0; score='final' and score='mean' take a "
+        r"negative one, for optimism\.$",
     ):
         AdaptiveScore(-1.0)

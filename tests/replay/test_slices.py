@@ -469,7 +469,7 @@ def test_a_storage_that_is_no_flat_tensor_storage_is_refused(storage):
     ("arguments", "message"),
     [
         ({"slice_len": 0}, "slice_len must be at least 1, got 0"),
-        ({"slice_len": 3, "uniform_over": "rows"}, "uniform_over must be 'episodes' or 'starts', got 'rows'"),
+        ({"slice_len": 3, "uniform_over": "rows"}, "uniform_over must be one of episodes, starts, got 'rows'"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):

@@ -162,7 +162,7 @@ def test_the_warm_start_is_carried_through_a_round_and_reset_between_rounds(batc
         carried.append(plan_mean.clone())
         return plan(observation, plan_mean, **options)
 
-    planner.plan = record
+    planner.compiled_plan = record
     env = side_by_side(4, 4) if batched else CountingEnv(4)
     env = env.append_transform(planner.make_tensordict_primer())
     evaluate(env, planner, episodes=4 if batched else 2)

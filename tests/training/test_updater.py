@@ -44,7 +44,7 @@ def make_world_model(**options) -> WorldModel:
 
 def make_updater(world_model: WorldModel | None = None, *, tau: float = TAU, lr: float = LR, **options) -> Updater:
     world_model = make_world_model() if world_model is None else world_model
-    loss = EfficientTDMPCLoss(world_model, discount=0.9, scale_tau=tau, **options)
+    loss = EfficientTDMPCLoss(world_model, discount=0.9, scale_tau=tau, ignore_termination=True, **options)
     return Updater(loss, lr=lr, grad_clip_norm=CLIP, tau=tau)
 
 
@@ -328,7 +328,7 @@ class SeparateSteps:
     """The same update as two backward passes and two optimisers, one after the other."""
 
     def __init__(self, world_model: WorldModel) -> None:
-        self.loss = EfficientTDMPCLoss(world_model, discount=0.9, distill=False)
+        self.loss = EfficientTDMPCLoss(world_model, discount=0.9, distill=False, ignore_termination=True)
         self.target_update = SoftUpdate(self.loss, tau=TAU)
         encoder = list(world_model.encoder.parameters())
         heads = [*world_model.dynamics.parameters(), *world_model.reward_head.parameters()]

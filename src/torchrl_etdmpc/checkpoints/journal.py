@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_etdmpc.replay.reanalyze import TARGETS
+from torchrl_etdmpc.keys import TARGETS
 from torchrl_etdmpc.runs.files import read_tensors, remove_partial_files, write_tensors
 
 ROWS_PER_FILE = 16_384

@@ -7,6 +7,8 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, Composite, TensorSpec
 
+from torchrl_etdmpc.keys import ACTION, FALLBACK, LOC, PLAN, PLAN_FIELDS, SCALE, VALUE, VERSION
+
 
 class SeedPolicy(TensorDictModuleBase):
     """Uniform random actions, stored with the target N(0, 1) (BMPC), under the keys that the planner writes.
@@ -30,9 +32,7 @@ class SeedPolicy(TensorDictModuleBase):
     [1.0, 1.0]
     """
 
-    def __init__(
-        self, action_spec: TensorSpec, *, action_key: NestedKey = "action", plan_key: NestedKey = "plan"
-    ) -> None:
+    def __init__(self, action_spec: TensorSpec, *, action_key: NestedKey = ACTION, plan_key: NestedKey = PLAN) -> None:
         super().__init__()
         if isinstance(action_spec, Composite):
             action_spec = action_spec[action_key]
@@ -40,9 +40,7 @@ class SeedPolicy(TensorDictModuleBase):
             raise ValueError(f"SeedPolicy needs a bounded continuous action, got {type(action_spec).__name__}.")
         self.action_spec = action_spec
         self.action_key = unravel_key(action_key)
-        self.plan_keys = {
-            name: unravel_key((plan_key, name)) for name in ("loc", "scale", "value", "version", "fallback")
-        }
+        self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}
         self.in_keys = []
         self.out_keys = [self.action_key, *self.plan_keys.values()]
 
@@ -51,11 +49,11 @@ class SeedPolicy(TensorDictModuleBase):
         action = self.action_spec.rand()
         flag = torch.zeros_like(action[..., :1])
         values = {
-            "loc": torch.zeros_like(action),
-            "scale": torch.ones_like(action),
-            "value": flag,
-            "version": flag.to(torch.int64),
-            "fallback": flag.bool(),
+            LOC: torch.zeros_like(action),
+            SCALE: torch.ones_like(action),
+            VALUE: flag,
+            VERSION: flag.to(torch.int64),
+            FALLBACK: flag.bool(),
         }
         tensordict.set(self.action_key, action)
         for name, value in values.items():

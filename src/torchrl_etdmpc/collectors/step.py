@@ -16,9 +16,8 @@ from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
+from torchrl_etdmpc.keys import TRAJECTORY as TRAJ_KEY
 from torchrl_etdmpc.runs.errors import first_line
-
-TRAJ_KEY = ("collector", "traj_ids")
 
 Insertion = Literal["step", "episode"]
 

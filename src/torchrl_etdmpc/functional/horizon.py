@@ -73,6 +73,7 @@ def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Te
     if beta == 0:
         return best.squeeze(-1), one_hot
     precision = std.clamp_min(SIGMA_FLOOR).square().reciprocal()
+    # Departure from the thesis, which proposes a gradient-based inner solver: the optimum has this closed form.
     excess = (mean.unsqueeze(-2) - mean.unsqueeze(-1)).clamp_min(0)  # [..., h, g] = max(q_g - q_h, 0)
     support = (precision.unsqueeze(-2) * excess.square()).sum(-1) <= beta**2
     weight = precision * support

@@ -75,6 +75,8 @@ def select_elites(actions: Tensor, scores: Tensor, num_elites: int) -> Elites:
     >>> select_elites(torch.zeros(3, 1, 1), torch.tensor([1.0, float("nan"), 2.0]), 2).scores.tolist()
     [2.0, 1.0]
     """
+    # Departure from BMPC and TD-MPC2, whose code replaces a non-finite score by 0: where returns are negative, 0 beats
+    # every candidate.
     scores = torch.where(scores.isfinite(), scores, -torch.inf)
     top, index = scores.topk(num_elites, dim=-1)
     index = index[..., None, None].expand(*index.shape, *actions.shape[-2:])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
@@ -14,14 +14,14 @@ from torchrl_etdmpc.functional import mish
 INIT_STD = 0.02
 
 Activation = Literal["mish", "silu", "relu"]
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"mish": mish, "silu": F.silu, "relu": F.relu}
+ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {"mish": mish, "silu": F.silu, "relu": F.relu}
 
 
 class EnsembleLinear(nn.Module):
     """A linear layer, or ``E`` independent ones whose weights are stacked and applied in one batched product.
 
-    Weights are drawn from a truncated normal with std 0.02 and biases are 0, in every member (spec of TD-MPC2; thesis
-    Table A.1 inherits it). ``zero_init=True`` starts the weights at zero as well.
+    Weights are drawn from a truncated normal with std 0.02 and biases are 0, in every member (TD-MPC2; thesis Table
+    A.1 inherits it). ``zero_init=True`` starts the weights at zero as well.
 
     Args:
         in_features (int): input size.
@@ -49,6 +49,8 @@ class EnsembleLinear(nn.Module):
             if self.zero_init:
                 self.weight.zero_()
             else:
+                # Departure from BMPC and TD-MPC2, whose code gave the members of an ensemble PyTorch's default
+                # initialisation until July 2026: every member gets what the papers state.
                 nn.init.trunc_normal_(self.weight, std=INIT_STD)
             self.bias.zero_()
 
@@ -72,7 +74,11 @@ class NormedLinear(EnsembleLinear):
         out_features (int): output size.
         activation (callable): applied last, ``[..., out] -> [..., out]``.
         num_members (int, optional): E, as in :class:`EnsembleLinear`.
-        dropout (float): probability of zeroing an output of the linear map, when ``forward`` is asked for it.
+        dropout (float): probability of zeroing an output of the linear map, when ``forward`` is asked for it; in
+            [0, 1).
+
+    Raises:
+        ValueError: if the probability is out of range.
 
     >>> NormedLinear(3, 8, activation=F.mish)(torch.zeros(2, 3)).shape
     torch.Size([2, 8])
@@ -87,6 +93,8 @@ class NormedLinear(EnsembleLinear):
         num_members: int | None = None,
         dropout: float = 0.0,
     ) -> None:
+        if not 0 <= dropout < 1:
+            raise ValueError(f"dropout must be in [0, 1), got {dropout}.")
         super().__init__(in_features, out_features, num_members=num_members)
         self.norm_weight = nn.Parameter(torch.ones_like(self.bias))
         self.norm_bias = nn.Parameter(torch.zeros_like(self.bias))
@@ -133,7 +141,7 @@ class MLP(nn.Module):
         zero_init_output (bool): start a linear output layer at zero.
 
     Raises:
-        ValueError: if the activation is unknown.
+        ValueError: if the activation is unknown or the dropout out of range.
 
     >>> MLP(3, [16], 2, num_members=4)(torch.zeros(4, 7, 3)).shape
     torch.Size([4, 7, 2])
@@ -152,8 +160,8 @@ class MLP(nn.Module):
         zero_init_output: bool = False,
     ) -> None:
         super().__init__()
-        if activation not in ACTIVATIONS:
-            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {activation!r}.")
+        if activation not in get_args(Activation):
+            raise ValueError(f"activation must be one of {', '.join(get_args(Activation))}, got {activation!r}.")
         sizes = [in_features, *hidden_sizes]
         self.hidden = nn.ModuleList(
             NormedLinear(

@@ -17,8 +17,12 @@ class GaussianPolicy(MLP):
         latent_dim (int): L.
         action_dim (int): A.
         hidden_dim (int): size of both hidden layers.
-        log_std_bounds (tuple of float): smallest and largest log standard deviation.
+        log_std_min (float): smallest log standard deviation.
+        log_std_max (float): largest log standard deviation.
         activation (str): of the hidden layers.
+
+    Raises:
+        ValueError: if ``log_std_min`` is not below ``log_std_max``.
 
     >>> import torch
     >>> mean, log_std = GaussianPolicy(16, 2)(torch.zeros(7, 16))
@@ -32,11 +36,14 @@ class GaussianPolicy(MLP):
         action_dim: int,
         *,
         hidden_dim: int = 512,
-        log_std_bounds: tuple[float, float] = (-3.0, 1.0),
+        log_std_min: float = -3.0,
+        log_std_max: float = 1.0,
         activation: Activation = "mish",
     ) -> None:
+        if log_std_min >= log_std_max:
+            raise ValueError(f"log_std_min must be below log_std_max={log_std_max}, got {log_std_min}.")
         super().__init__(latent_dim, [hidden_dim] * 2, 2 * action_dim, activation=activation)
-        self.log_std_bounds = tuple(log_std_bounds)
+        self.log_std_bounds = (log_std_min, log_std_max)
 
     def forward(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and log std of the action distribution.

@@ -16,6 +16,8 @@ from torchrl_etdmpc.modules.policy import GaussianPolicy
 class WorldModel(nn.Module):
     """All networks of EfficientTDMPC in one module (thesis Table 3.1 and Table A.1); prediction only.
 
+    It is a :class:`~torchrl_etdmpc.modules.PredictionModel`: planners ask nothing else of it.
+
     One instance is shared by the planner, the losses and the reanalyze transform, so there is one set of weights and
     nothing to synchronise within a process. Ensembles are stacked; latents of several heads carry the head dimension
     first, ``[F, ..., L]``.
@@ -31,20 +33,25 @@ class WorldModel(nn.Module):
         num_values (int): V, value heads.
         simnorm_dim (int): group size of SimNorm.
         num_bins (int): M, bins of the reward and value distributions.
-        bin_range (tuple of float): first and last bin centre in symlog space.
-        dropout (float): of the first hidden layer of the value heads.
-        log_std_bounds (tuple of float): of the policy.
+        bin_min (float): first bin centre, in symlog space.
+        bin_max (float): last bin centre, in symlog space.
+        dropout (float): of the first hidden layer of the value heads, in [0, 1).
+        log_std_min (float): smallest log standard deviation of the policy.
+        log_std_max (float): largest log standard deviation of the policy.
         activation (str): ``"mish"``, ``"silu"`` or ``"relu"``.
         termination (bool): whether to build a termination head. Default: ``False`` (DMC never terminates).
 
     Raises:
-        ValueError: if a size is not positive or L is not a multiple of ``simnorm_dim``.
+        ValueError: if an argument is out of range, or L is not a multiple of ``simnorm_dim``.
 
     >>> model = WorldModel(24, 6, latent_dim=32, mlp_dim=64)
     >>> latent = model.encode(torch.zeros(7, 24))
     >>> model.next(latent.unsqueeze(0), torch.zeros(7, 6)).shape
     torch.Size([4, 7, 32])
     """
+
+    bins: Tensor
+    version: Tensor
 
     def __init__(
         self,
@@ -59,9 +66,11 @@ class WorldModel(nn.Module):
         num_values: int = 2,
         simnorm_dim: int = 8,
         num_bins: int = 101,
-        bin_range: tuple[float, float] = (-10.0, 10.0),
+        bin_min: float = -10.0,
+        bin_max: float = 10.0,
         dropout: float = 0.01,
-        log_std_bounds: tuple[float, float] = (-3.0, 1.0),
+        log_std_min: float = -3.0,
+        log_std_max: float = 1.0,
         activation: Activation = "mish",
         termination: bool = False,
     ) -> None:
@@ -85,10 +94,10 @@ class WorldModel(nn.Module):
                 f"latent_dim must be a multiple of simnorm_dim={simnorm_dim}, got {latent_dim}; "
                 f"the nearest is {max(round(latent_dim / simnorm_dim), 1) * simnorm_dim}."
             )
-        if num_bins < 2 or bin_range[0] >= bin_range[1]:
-            raise ValueError(
-                f"num_bins must be at least 2 and bin_range ascending, got num_bins={num_bins}, bin_range={bin_range}."
-            )
+        if num_bins < 2:
+            raise ValueError(f"num_bins must be at least 2, got {num_bins}.")
+        if bin_min >= bin_max:
+            raise ValueError(f"bin_min must be below bin_max={bin_max}, got {bin_min}.")
         self.observation_dim = observation_dim
         self.action_dim = action_dim
         self.latent_dim = latent_dim
@@ -122,12 +131,17 @@ class WorldModel(nn.Module):
             activation=activation,
         )
         self.policy = GaussianPolicy(
-            latent_dim, action_dim, hidden_dim=mlp_dim, log_std_bounds=log_std_bounds, activation=activation
+            latent_dim,
+            action_dim,
+            hidden_dim=mlp_dim,
+            log_std_min=log_std_min,
+            log_std_max=log_std_max,
+            activation=activation,
         )
         self.termination_head = (
             TerminationHead(latent_dim, hidden_dim=mlp_dim, activation=activation) if termination else None
         )
-        self.register_buffer("bins", torch.linspace(*bin_range, num_bins))
+        self.register_buffer("bins", torch.linspace(bin_min, bin_max, num_bins))
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
         """How many gradient updates made these weights; stamped on every planner target."""
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from torch import Tensor
 
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices
+from torchrl_etdmpc.objectives.latent_rollout import ExtraTerm, LatentRollout, LatentRolloutLoss, Reduction, Slices
 from torchrl_etdmpc.objectives.policy import KLDirection, policy_terms, register_running_scale
 from torchrl_etdmpc.objectives.value import register_discount, value_terms
 from torchrl_etdmpc.objectives.world_model import model_terms
@@ -36,6 +38,11 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         distill (bool): whether to compute the policy term. The attribute can be changed later: pretraining on random
             data turns it off. Default: ``True``.
+        extra_terms (mapping of str to ExtraTerm, optional): terms of one's own, weighted by ``rho^k`` like the others;
+            ``name`` adds ``loss_name``, the metric ``name_error`` and the buffer ``name_coef``.
+        ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
+            head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
+            error; on CUDA, where looking would wait for the device, nothing is checked. Default: ``False``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
     Raises:
@@ -77,7 +84,9 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         kl_direction: KLDirection = "backward",
         rho: float = 0.5,
         distill: bool = True,
-        reduction: str | None = None,
+        extra_terms: Mapping[str, ExtraTerm] | None = None,
+        ignore_termination: bool = False,
+        reduction: Reduction | None = None,
     ) -> None:
         super().__init__(
             world_model,
@@ -92,6 +101,8 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
             },
             rho=rho,
             reduction=reduction,
+            ignore_termination=ignore_termination,
+            extra_terms=extra_terms,
         )
         register_discount(self, discount)
         register_running_scale(self, scale_tau, kl_direction)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
@@ -13,7 +13,10 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
+
+Reduction = Literal["none", "mean", "sum"]
 
 
 class Slices(NamedTuple):
@@ -45,6 +48,33 @@ class LatentRollout(NamedTuple):
     from the same zhat_0."""
 
 
+TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor]
+
+
+class ExtraTerm(NamedTuple):
+    """A term of one's own that trains the networks at hand.
+
+    Its gradient goes wherever the function lets it.
+
+    >>> def small_actions(world_model, slices, rollout):
+    ...     mean, _ = world_model.policy(rollout.predicted[:-1].detach())  # [T, F, B, A]
+    ...     return mean.square().mean((1, -1))
+    >>> from torchrl.objectives import SoftUpdate
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> loss = EfficientTDMPCLoss(model, discount=0.99, extra_terms={"small_actions": ExtraTerm(small_actions, 0.1)})
+    >>> updater = SoftUpdate(loss, tau=0.01)
+    >>> "loss_small_actions" in loss(random_slices(3, 2))
+    True
+    """
+
+    function: TermFunction
+    """World model, slices and their rollout to an error of every step of every slice, ``[T, B]``."""
+    coef: float
+    """Weight of the term."""
+
+
 def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
     """Encodes every observation and rolls every dynamics head from the first one (spec of BMPC; thesis appendix B).
 
@@ -67,23 +97,26 @@ def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
     return LatentRollout(torch.cat([first.detach().unsqueeze(0), later]), torch.stack(latents))
 
 
-def distinct(steps: Tensor, num_heads: int | None = None) -> Tensor:
-    """What a network has to be asked about the first T steps of a rollout: step 0, on which the heads agree, only once.
+def head_rows(steps: Tensor, num_heads: int | None = None) -> Tensor:
+    """One row for every step and head of a rollout; step 0, on which the heads agree, has one row for all of them.
 
     Args:
-        steps (Tensor): ``[T, F, B, ...]``, or ``[T, B, ...]`` with ``num_heads``: the same for all heads.
+        steps (Tensor): T steps, ``[T, F, B, ...]``, or ``[T, B, ...]`` with ``num_heads``: the same for all heads.
         num_heads (int, optional): F, for an entry without a head dimension.
 
     Returns:
         Tensor: ``[1 + (T - 1) F, B, ...]``.
     """
+    # Departure from BMPC and the thesis, which read every head's rollout at step 0 as well, where they are equal: the
+    # same average from fewer rows, but one dropout mask there instead of one per head, and the percentiles of the
+    # running scale count each slice once.
     if num_heads is not None:
         steps = steps.unsqueeze(1).expand(-1, num_heads, *steps.shape[1:])
     return torch.cat([steps[0, :1], steps[1:].flatten(0, 1)])
 
 
-def mean_over_heads(answers: Tensor, num_heads: int) -> Tensor:
-    """Mean over dynamics heads of what :func:`distinct` asked, ``[1 + (T - 1) F, B]`` to ``[T, B]``."""
+def mean_of_head_rows(answers: Tensor, num_heads: int) -> Tensor:
+    """Mean over heads of what was computed on :func:`head_rows`, ``[1 + (T - 1) F, B]`` to ``[T, B]``."""
     return torch.cat([answers[:1], answers[1:].unflatten(0, (-1, num_heads)).mean(1)]) if len(answers) > 1 else answers
 
 
@@ -107,22 +140,25 @@ class LatentRolloutLoss(LossModule):
             observation (NestedKey): flat observation ``[B, T, O]``; its successor is read at ``("next", observation)``.
             action (NestedKey): replayed action ``[B, T, A]`` in [-1, 1].
             reward (NestedKey): read at ``("next", reward)``, ``[B, T, 1]``.
-            terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head.
+            terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head;
+                without one it is looked at only to refuse termination.
             plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
             plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``.
         """
 
-        observation: NestedKey = "observation"
-        action: NestedKey = "action"
-        reward: NestedKey = "reward"
-        terminated: NestedKey = "terminated"
-        plan_loc: NestedKey = ("plan", "loc")
-        plan_scale: NestedKey = ("plan", "scale")
+        observation: NestedKey = OBSERVATION
+        action: NestedKey = ACTION
+        reward: NestedKey = REWARD
+        terminated: NestedKey = TERMINATED
+        plan_loc: NestedKey = (PLAN, LOC)
+        plan_scale: NestedKey = (PLAN, SCALE)
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     default_value_estimator = None
 
+    world_model: WorldModel
+    rho: Tensor
     encoder: nn.Module
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
@@ -158,14 +194,16 @@ class LatentRolloutLoss(LossModule):
         networks: tuple[str, ...],
         coefficients: dict[str, float],
         rho: float,
-        reduction: str | None,
+        reduction: Reduction | None,
+        ignore_termination: bool = True,
+        extra_terms: Mapping[str, ExtraTerm] | None = None,
     ) -> None:
         super().__init__()
         self._in_keys = None
         self._out_keys = None
         self.reduction = "mean" if reduction is None else reduction
-        if self.reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
+        if self.reduction not in get_args(Reduction):
+            raise ValueError(f"reduction must be one of {', '.join(get_args(Reduction))}, got {reduction!r}.")
         if not 0 < rho <= 1:
             raise ValueError(f"rho must be in (0, 1], got {rho}.")
         for name in networks:
@@ -176,6 +214,14 @@ class LatentRolloutLoss(LossModule):
         for term, coefficient in coefficients.items():
             self.register_coeff_buffer(f"{term}_coef", float(coefficient))
         self.register_buffer("rho", torch.tensor(float(rho)))
+        self.ignore_termination = ignore_termination
+        self.extra_terms = dict(extra_terms or {})
+        for term, extra in self.extra_terms.items():
+            if not isinstance(extra, ExtraTerm):
+                raise TypeError(f"extra_terms must be of type ExtraTerm(function, coef), got {extra!r} for {term!r}.")
+            if term in (*self._attributes, *coefficients):
+                raise ValueError(f"extra_terms must have names of their own, got {term!r}; choose another one.")
+            self.register_coeff_buffer(f"{term}_coef", float(extra.coef))
 
     def _apply(self, fn, *args, **kwargs):
         # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
@@ -186,9 +232,12 @@ class LatentRolloutLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         self._in_keys = None  # a new name for a key changes what dispatch expects
 
-    def __setstate__(self, state) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        # deepcopy clones the entries of a tensordict, which parts a copied loss from its world model.
+        # The entries of <name>_params are the very parameters of the world model's networks, and planner, loss and
+        # updater rely on it. A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__,
+        # where convert_to_functional put them), but tensordict clones its entries: the loss would train weights that
+        # nobody reads. So they are read anew from the networks. The targets are nobody else's and stay as copied.
         for name in self._attributes:
             if f"{name}_params" in self._modules:
                 self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
@@ -225,7 +274,7 @@ class LatentRolloutLoss(LossModule):
 
     def _key(self, name: str) -> NestedKey:
         key = getattr(self.tensor_keys, name.removeprefix("next_"))
-        return unravel_key(("next", key)) if name in ("next_observation", "reward", "terminated") else unravel_key(key)
+        return unravel_key((NEXT, key)) if name in ("next_observation", "reward", "terminated") else unravel_key(key)
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -242,7 +291,8 @@ class LatentRolloutLoss(LossModule):
     def out_keys(self) -> list[str]:
         """Keys that ``forward`` returns: the ``loss_*`` terms, then the metrics."""
         if self._out_keys is None:
-            return [f"loss_{name}" for name in self._term_names] + list(self._metric_names)
+            extra = [f"{name}_error" for name in self.extra_terms]
+            return [f"loss_{name}" for name in (*self._term_names, *self.extra_terms)] + [*self._metric_names, *extra]
         return self._out_keys
 
     @out_keys.setter
@@ -256,9 +306,11 @@ class LatentRolloutLoss(LossModule):
             tensordict (TensorDictBase): batch size [B, T].
 
         Raises:
-            ValueError: if an entry is not of shape [B, T, features].
+            ValueError: if an entry is not of shape [B, T, features], or a row of a CPU tensor terminates although the
+                world model has no termination head. Elsewhere that check would wait for the device and is skipped.
             KeyError: if a key is missing.
         """
+        self._refuse_termination(tensordict)
         fields = dict.fromkeys(Slices._fields)
         for name in self._reads:
             value = tensordict.get(self._key(name), None)
@@ -281,6 +333,17 @@ class LatentRolloutLoss(LossModule):
                 fields[name] = fields[name].squeeze(-1)
         return Slices(**fields)
 
+    def _refuse_termination(self, tensordict: TensorDictBase) -> None:
+        if self.ignore_termination or self.world_model.termination_head is not None or torch.compiler.is_compiling():
+            return
+        terminated = tensordict.get(self._key("terminated"), None)
+        if terminated is not None and terminated.device.type == "cpu" and terminated.any():
+            raise ValueError(
+                f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
+                "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
+                f"{type(self).__name__}(..., ignore_termination=True) if that is what you want."
+            )
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms on a batch of slices.
@@ -293,7 +356,7 @@ class LatentRolloutLoss(LossModule):
             coefficients and by ``rho^k`` at step k, and detached scalar metrics.
 
         Raises:
-            ValueError: if an entry is not of shape [B, T, features].
+            ValueError: as :meth:`slices`.
             KeyError: if a key is missing.
         """
 
@@ -328,7 +391,16 @@ class LatentRolloutLoss(LossModule):
         Returns:
             dict: ``loss_*`` terms weighted by their coefficients, and detached metrics.
         """
-        terms, metrics = self._terms(slices, latent_rollout(self.__dict__["world_model"], slices), target_values)
+        rollout = latent_rollout(self.world_model, slices)
+        terms, metrics = self._terms(slices, rollout, target_values)
+        for name, extra in self.extra_terms.items():
+            error = extra.function(self.world_model, slices, rollout)
+            if error.shape != slices.action.shape[:2]:
+                raise ValueError(
+                    f"extra_terms[{name!r}] must return an error of shape [T, B]={list(slices.action.shape[:2])}, got "
+                    f"{list(error.shape)}."
+                )
+            terms[name], metrics[f"{name}_error"] = self._discount_depth(error), error.mean()
         out = {f"loss_{name}": getattr(self, f"{name}_coef") * reduce(term) for name, term in terms.items()}
         out.update({name: metric.detach() for name, metric in metrics.items()})
         return out

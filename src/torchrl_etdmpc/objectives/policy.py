@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
 from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices, distinct, mean_over_heads
+from torchrl_etdmpc.objectives.latent_rollout import (
+    LatentRollout,
+    LatentRolloutLoss,
+    Reduction,
+    Slices,
+    head_rows,
+    mean_of_head_rows,
+)
 
 KLDirection = Literal["backward", "forward"]
 
@@ -49,6 +56,8 @@ def distillation(
     policy = (mean, log_std.exp())
     plan = (plan_loc, plan_scale)
     kl = gaussian_kl(*policy, *plan) if kl_direction == "backward" else gaussian_kl(*plan, *policy)
+    # Departure from BMPC and TD-MPC2, which take minus the log-probability of a sample for the entropy: the closed form
+    # has the same gradient and no noise.
     return Distillation(kl.mean(-1), gaussian_entropy(log_std).sum(-1))
 
 
@@ -90,7 +99,7 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
         scale_tau: float = 0.01,
         kl_direction: KLDirection = "backward",
         rho: float = 0.5,
-        reduction: str | None = None,
+        reduction: Reduction | None = None,
     ) -> None:
         super().__init__(
             world_model,
@@ -119,12 +128,12 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
         return policy_terms(self, slices, rollout)
 
 
-def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_direction: str) -> None:
+def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_direction: KLDirection) -> None:
     """Checks the options of the distillation and registers its running scale on the loss."""
     if not 0 <= scale_tau <= 1:
         raise ValueError(f"scale_tau must be in [0, 1], got {scale_tau}.")
-    if kl_direction not in ("backward", "forward"):
-        raise ValueError(f"kl_direction must be 'backward' or 'forward', got {kl_direction!r}.")
+    if kl_direction not in get_args(KLDirection):
+        raise ValueError(f"kl_direction must be one of {', '.join(get_args(KLDirection))}, got {kl_direction!r}.")
     loss.scale_tau = scale_tau
     loss.kl_direction = kl_direction
     loss.register_buffer("kl_scale", torch.ones(()))
@@ -135,13 +144,14 @@ def policy_terms(
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Term ``[T, B]`` and metrics of the policy, for any loss with a running scale."""
     heads = loss.world_model.num_dynamics
-    latent = distinct(rollout.predicted[:-1])
-    plan = distinct(slices.plan_loc, heads), distinct(slices.plan_scale, heads)
+    latent = head_rows(rollout.predicted[:-1])
+    plan = head_rows(slices.plan_loc, heads), head_rows(slices.plan_scale, heads)
     kl, entropy = distillation(loss.world_model, latent, *plan, kl_direction=loss.kl_direction)
+    # Departure from BMPC, which moves the scale in every policy step: an evaluation of the loss must not change it.
     if loss.training:
         loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau))
     scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
     term = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
-    policy_kl, policy_entropy = (mean_over_heads(value, heads).mean() for value in (kl, entropy))
+    policy_kl, policy_entropy = (mean_of_head_rows(value, heads).mean() for value in (kl, entropy))
     metrics = {"policy_kl": policy_kl, "policy_entropy": policy_entropy, "kl_scale": scale}
-    return {"policy": loss._discount_depth(mean_over_heads(term, heads))}, metrics
+    return {"policy": loss._discount_depth(mean_of_head_rows(term, heads))}, metrics

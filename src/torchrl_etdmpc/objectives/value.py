@@ -10,7 +10,14 @@ from torch.func import functional_call
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices, distinct, mean_over_heads
+from torchrl_etdmpc.objectives.latent_rollout import (
+    LatentRollout,
+    LatentRolloutLoss,
+    Reduction,
+    Slices,
+    head_rows,
+    mean_of_head_rows,
+)
 
 
 @torch.no_grad()
@@ -58,9 +65,9 @@ def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor,
         Tensor: mean over value and dynamics heads, shape ``[T, B]``.
     """
     heads = world_model.num_dynamics
-    logits = world_model.value_head(distinct(rollout.predicted[:-1]), dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
-    error = two_hot_cross_entropy(logits, distinct(target, heads), world_model.bins)
-    return mean_over_heads(error.mean(0), heads)
+    logits = world_model.value_head(head_rows(rollout.predicted[:-1]), dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
+    error = two_hot_cross_entropy(logits, head_rows(target, heads), world_model.bins)
+    return mean_of_head_rows(error.mean(0), heads)
 
 
 class EfficientTDMPCValueLoss(LatentRolloutLoss):
@@ -76,6 +83,9 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         discount (float): gamma, in (0, 1].
         value_coef (float): weight of the term. Default: 0.1.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
+        ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
+            head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
+            error; on CUDA, where looking would wait for the device, nothing is checked. Default: ``False``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
     Raises:
@@ -98,7 +108,8 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         discount: float,
         value_coef: float = 0.1,
         rho: float = 0.5,
-        reduction: str | None = None,
+        ignore_termination: bool = False,
+        reduction: Reduction | None = None,
     ) -> None:
         super().__init__(
             world_model,
@@ -106,6 +117,7 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
             coefficients={"value": value_coef},
             rho=rho,
             reduction=reduction,
+            ignore_termination=ignore_termination,
         )
         register_discount(self, discount)
 

@@ -7,7 +7,14 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, LatentRolloutLoss, Slices, distinct, mean_over_heads
+from torchrl_etdmpc.objectives.latent_rollout import (
+    LatentRollout,
+    LatentRolloutLoss,
+    Reduction,
+    Slices,
+    head_rows,
+    mean_of_head_rows,
+)
 
 
 def consistency_error(rollout: LatentRollout) -> Tensor:
@@ -38,9 +45,9 @@ def reward_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices
         Tensor: mean over heads, shape ``[T, B]``.
     """
     heads = world_model.num_dynamics
-    logits = world_model.reward_head(distinct(rollout.predicted[:-1]), distinct(slices.action, heads))
-    error = two_hot_cross_entropy(logits, distinct(slices.reward, heads), world_model.bins)
-    return mean_over_heads(error, heads)
+    logits = world_model.reward_head(head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads))
+    error = two_hot_cross_entropy(logits, head_rows(slices.reward, heads), world_model.bins)
+    return mean_of_head_rows(error, heads)
 
 
 def termination_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices) -> Tensor:
@@ -74,6 +81,9 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
         termination_coef (float): weight of the termination term. Default: 1.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5. The termination term is not
             decayed: a terminal state is always the last of its slice, so a decay would bias the predicted probability.
+        ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
+            head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
+            error; on CUDA, where looking would wait for the device, nothing is checked. Default: ``False``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
     Raises:
@@ -95,7 +105,8 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
         reward_coef: float = 0.1,
         termination_coef: float = 1.0,
         rho: float = 0.5,
-        reduction: str | None = None,
+        ignore_termination: bool = False,
+        reduction: Reduction | None = None,
     ) -> None:
         super().__init__(
             world_model,
@@ -107,6 +118,7 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
             },
             rho=rho,
             reduction=reduction,
+            ignore_termination=ignore_termination,
         )
 
     @property
@@ -137,6 +149,8 @@ def model_terms(
         "reward": reward_error(loss.world_model, rollout, slices),
     }
     terms = {name: loss._discount_depth(error) for name, error in errors.items()}
+    # Departure from the thesis, which states no weight: not decayed with rho, because a terminal state is always the
+    # last of its slice and a decay would bias the probability.
     if loss.world_model.termination_head is not None:
         terms["termination"] = errors["termination"] = termination_error(loss.world_model, rollout, slices)
     return terms, {f"{name}_error": error.mean() for name, error in errors.items()}

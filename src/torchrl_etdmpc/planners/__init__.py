@@ -1,17 +1,38 @@
-"""Planners and their objectives."""
+"""Planners, their objectives, and the imagined environment that they plan in."""
 
-from torchrl_etdmpc.planners.ensemble_mppi import EnsembleMPPIPlanner
+from torchrl_etdmpc.planners.ensemble_mppi import EnsembleMPPIPlanner, FirstAction, ScoringDtype
+from torchrl_etdmpc.planners.export import export_planner, export_policy
+from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
-from torchrl_etdmpc.planners.scores import AdaptiveScore, FinalScore, MeanScore, Score, make_score
+from torchrl_etdmpc.planners.scores import (
+    AdaptiveScore,
+    Depths,
+    FinalScore,
+    FunctionScore,
+    MeanScore,
+    Score,
+    ScoreFunction,
+    ScoreName,
+    make_score,
+)
 
 __all__ = [
     "AdaptiveScore",
+    "Depths",
     "EnsembleMPPIPlanner",
     "FinalScore",
+    "FirstAction",
+    "FunctionScore",
+    "LatentEnv",
     "MeanScore",
     "Plan",
     "PlanNoise",
     "PlanTrace",
     "Score",
+    "ScoreFunction",
+    "ScoreName",
+    "ScoringDtype",
+    "export_planner",
+    "export_policy",
     "make_score",
 ]

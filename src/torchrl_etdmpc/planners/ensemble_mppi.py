@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -14,8 +15,8 @@ from torchrl.envs import ExplorationType, TensorDictPrimer
 from torchrl.envs.utils import exploration_type
 from torchrl.modules import MPCPlannerBase
 
-from torchrl_etdmpc.envs.latent import LatentEnv
 from torchrl_etdmpc.functional import (
+    Elites,
     Gaussian,
     clipped_sample,
     elite_weights,
@@ -25,11 +26,29 @@ from torchrl_etdmpc.functional import (
     select_elites,
     shift_plan,
 )
+from torchrl_etdmpc.keys import (
+    ACTION,
+    FALLBACK,
+    IS_INIT,
+    LATENT,
+    LOC,
+    NEXT,
+    OBSERVATION,
+    PLAN,
+    PLAN_FIELDS,
+    PLAN_MEAN,
+    SCALE,
+    VALUE,
+    VERSION,
+)
+from torchrl_etdmpc.modules.prediction import PredictionModel
 from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
+from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
-from torchrl_etdmpc.planners.scores import Score, make_score
+from torchrl_etdmpc.planners.scores import Score, ScoreFunction, ScoreName, make_score
 
 FirstAction = Literal["elite", "mean", "best"]
+ScoringDtype = Literal["float16", "bfloat16", "float32", "float64"]
 
 
 class EnsembleMPPIPlanner(MPCPlannerBase):
@@ -48,7 +67,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     cold, and warns once unless all episodes have just begun.
 
     Args:
-        env (LatentEnv): the world model as an environment.
+        env (LatentEnv): the world model as an environment. Any
+            :class:`~torchrl_etdmpc.modules.PredictionModel` will do.
 
     Keyword Args:
         horizon (int): H, actions per sequence. Default: 6.
@@ -60,7 +80,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         extra_iterations (int): added if the action has more than ``large_action_dim`` dimensions. Default: 2.
         large_action_dim (int): Default: 20.
         score (str or callable): ``"final"``, ``"mean"``, ``"adaptive"`` or a callable from the return table
-            ``[..., D, F, V]`` to ``[...]``. Default: ``"mean"``.
+            ``[..., D, F, V]`` to ``[...]``, see :class:`~torchrl_etdmpc.planners.Score`. Default: ``"mean"``.
         beta (float): penalty on the ensemble's standard deviation, for a named score. Default: 0.
         discount (float): gamma, in (0, 1]. Default: 0.99.
         inverse_temperature (float): of the elites' weights (the lineage calls it "temperature"). Default: 0.5.
@@ -70,17 +90,24 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             formula) or ``"best"`` (highest-scoring candidate of the last iteration). Default: ``"elite"``.
         eval_first_action (str): the same, when not exploring. Default: ``"best"``.
         warm_start (bool): whether to carry the plan from step to step. Default: ``True``.
-        scoring_dtype (torch.dtype, optional): in which candidates are rolled and scored, e.g. ``torch.bfloat16``; the
-            weights are cast once per call, and returns are summed in the weights' own dtype. Default: ``None``, that of
-            the weights.
-        proposal_log_std_bounds (tuple of float, optional): bounds of the policy's log std while it proposes; BMPC
-            widens them to (-2, 1) for reanalyze. Default: the policy's own.
+        scoring_dtype (torch.dtype or str, optional): in which candidates are rolled and scored, e.g.
+            ``torch.bfloat16`` or ``"bfloat16"``; the weights are cast once per call, and returns are summed in the
+            weights' own dtype. Default: ``None``, that of the weights.
+        proposal_log_std_min (float, optional): smallest log std of the policy while it proposes; BMPC widens the bounds
+            to -2 and 1 for reanalyze. Default: the policy's own.
+        proposal_log_std_max (float, optional): the largest one; both are given or neither.
         observation_key, action_key, is_init_key, plan_mean_key (NestedKey): tensordict keys.
         latent_key (NestedKey, optional): where a :class:`LatentEnv` holds its state. ``None``: plan from observations
             only. Default: ``"latent"``.
         plan_key (NestedKey): root of the target: ``loc``, ``scale``, ``value``, ``version`` and ``fallback`` below it.
 
+    Attributes:
+        compiled_plan (callable, optional): what ``forward`` calls in the place of :meth:`plan` if it is set, e.g.
+            ``torch.compile(planner.plan)``; ``plan`` itself is never replaced. It belongs to this object: a copy of the
+            planner starts without one. Default: ``None``.
+
     Raises:
+        TypeError: if ``env`` is not a :class:`LatentEnv`.
         ValueError: if an argument is out of range.
 
     >>> from tensordict import TensorDict
@@ -102,7 +129,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         iterations: int = 6,
         extra_iterations: int = 2,
         large_action_dim: int = 20,
-        score: str | Score = "mean",
+        score: ScoreName | Score | ScoreFunction = "mean",
         beta: float = 0.0,
         discount: float = 0.99,
         inverse_temperature: float = 0.5,
@@ -111,41 +138,26 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         first_action: FirstAction = "elite",
         eval_first_action: FirstAction = "best",
         warm_start: bool = True,
-        scoring_dtype: torch.dtype | None = None,
-        proposal_log_std_bounds: tuple[float, float] | None = None,
-        observation_key: NestedKey = "observation",
-        latent_key: NestedKey | None = "latent",
-        action_key: NestedKey = "action",
-        is_init_key: NestedKey = "is_init",
-        plan_mean_key: NestedKey = "plan_mean",
-        plan_key: NestedKey = "plan",
+        scoring_dtype: torch.dtype | ScoringDtype | None = None,
+        proposal_log_std_min: float | None = None,
+        proposal_log_std_max: float | None = None,
+        observation_key: NestedKey = OBSERVATION,
+        latent_key: NestedKey | None = LATENT,
+        action_key: NestedKey = ACTION,
+        is_init_key: NestedKey = IS_INIT,
+        plan_mean_key: NestedKey = PLAN_MEAN,
+        plan_key: NestedKey = PLAN,
     ) -> None:
         if not isinstance(env, LatentEnv):
             raise TypeError(
                 f"EnsembleMPPIPlanner needs a LatentEnv, got {type(env).__name__}; wrap the networks: "
                 "LatentEnv(world_model)."
             )
-        for name, number in {"horizon": horizon, "iterations": iterations, "num_elites": num_elites}.items():
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}.")
-        if num_elites > num_samples:
-            raise ValueError(f"num_elites must be at most num_samples={num_samples}, got {num_elites}.")
-        if not 0 <= num_proposals < num_samples:
-            raise ValueError(f"num_proposals must be in [0, num_samples={num_samples}), got {num_proposals}.")
-        if extra_iterations < 0 or inverse_temperature < 0:
-            raise ValueError(
-                f"extra_iterations and inverse_temperature must not be negative, got {extra_iterations} and "
-                f"{inverse_temperature}."
-            )
-        if not 0 < std_min <= std_max:
-            raise ValueError(f"std_min and std_max must satisfy 0 < std_min <= std_max, got {std_min} and {std_max}.")
-        if not 0 < discount <= 1:
-            raise ValueError(f"discount must be in (0, 1], got {discount}.")
-        if scoring_dtype is not None and not scoring_dtype.is_floating_point:
-            raise ValueError(f"scoring_dtype must be a floating point dtype, got {scoring_dtype}.")
+        _check_budget(horizon, num_samples, num_elites, num_proposals, iterations, extra_iterations)
+        _check_fit(discount, inverse_temperature, std_min, std_max)
         for name, choice in {"first_action": first_action, "eval_first_action": eval_first_action}.items():
-            if choice not in ("elite", "mean", "best"):
-                raise ValueError(f"{name} must be 'elite', 'mean' or 'best', got {choice!r}.")
+            if choice not in get_args(FirstAction):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(FirstAction))}, got {choice!r}.")
         super().__init__(env, action_key=action_key)
         del self._modules["env"]  # the base class registers it twice; the state dict should list the weights once
         self.__dict__["env"] = env
@@ -153,6 +165,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.num_samples = num_samples
         self.num_elites = num_elites
         self.num_proposals = num_proposals
+        # Departure from BMPC, whose code adds them from large_action_dim dimensions on: above it, as the thesis says.
         self.iterations = iterations + (extra_iterations if self.world_model.action_dim > large_action_dim else 0)
         self.score = make_score(score, beta)
         self.discount = discount
@@ -162,17 +175,16 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.first_action = first_action
         self.eval_first_action = eval_first_action
         self.warm_start = warm_start
-        self.scoring_dtype = scoring_dtype
+        self.scoring_dtype = _floating_dtype(scoring_dtype)
+        self.proposal_log_std_bounds = _both_or_none(proposal_log_std_min, proposal_log_std_max)
+        self.compiled_plan: Callable[..., Plan] | None = None
         self.__dict__["_imagination"] = _Imagination(env.world_model)
-        self.proposal_log_std_bounds = proposal_log_std_bounds
         self.observation_key = unravel_key(observation_key)
         self.latent_key = None if latent_key is None else unravel_key(latent_key)
         self.is_init_key = unravel_key(is_init_key)
         self.plan_mean_key = unravel_key(plan_mean_key)
-        self.next_plan_mean_key = unravel_key(("next", plan_mean_key))
-        self.plan_keys = {
-            name: unravel_key((plan_key, name)) for name in ("loc", "scale", "value", "version", "fallback")
-        }
+        self.next_plan_mean_key = unravel_key((NEXT, plan_mean_key))
+        self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}
         self._warned_cold = False
         carried = [self.is_init_key, self.plan_mean_key] if warm_start else []
         self.in_keys = [self.observation_key, *carried]
@@ -183,9 +195,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         ]
 
     @property
-    def world_model(self):
+    def world_model(self) -> PredictionModel:
         """The networks that the planner reads."""
         return self.env.world_model
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What was compiled is bound to this object: in a copy it would go on planning with the original's weights.
+        return super().__getstate__() | {"compiled_plan": None}
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Transform that adds the warm start to an environment's reset and zeroes it there.
@@ -227,14 +243,15 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             )
         explore = exploration_type() is ExplorationType.RANDOM
         carried, carry = self._read_warm_start(tensordict)
-        plan = self.plan(observation, carried, latent=latent, explore=explore)
+        make_plan = self.plan if self.compiled_plan is None else self.compiled_plan
+        plan = make_plan(observation, carried, latent=latent, explore=explore)
         outputs = {
             self.out_keys[0]: plan.action,
-            self.plan_keys["loc"]: plan.loc,
-            self.plan_keys["scale"]: plan.scale,
-            self.plan_keys["value"]: plan.value.unsqueeze(-1),
-            self.plan_keys["version"]: self.world_model.version.expand(*plan.value.shape, 1).clone(),
-            self.plan_keys["fallback"]: plan.fallback.unsqueeze(-1),
+            self.plan_keys[LOC]: plan.loc,
+            self.plan_keys[SCALE]: plan.scale,
+            self.plan_keys[VALUE]: plan.value.unsqueeze(-1),
+            self.plan_keys[VERSION]: self.world_model.version.expand(*plan.value.shape, 1).clone(),
+            self.plan_keys[FALLBACK]: plan.fallback.unsqueeze(-1),
         }
         if carry:
             outputs[self.next_plan_mean_key] = plan.mean
@@ -262,11 +279,27 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             carried = torch.where(is_init.unsqueeze(-1), torch.zeros_like(carried), carried)
         return carried, True
 
-    def draw_noise(self, *batch_size: int, generator: torch.Generator | None = None) -> PlanNoise:
-        """Draws the random numbers of one :meth:`plan` call for a leading batch, on the world model's device."""
+    def draw_noise(
+        self,
+        *batch_size: int,
+        generator: torch.Generator | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> PlanNoise:
+        """Draws the random numbers of one :meth:`plan` call for a leading batch.
+
+        Args:
+            *batch_size (int): the leading batch.
+            generator (torch.Generator, optional): Default: PyTorch's global one.
+            device (torch.device or str, optional): of the latents. Default: that of the world model.
+            dtype (torch.dtype, optional): of the latents. Default: that of the world model.
+        """
+        if device is None or dtype is None:
+            own_device, own_dtype = self.env.device_and_dtype()
+            device, dtype = own_device if device is None else device, own_dtype if dtype is None else dtype
         actions = (self.horizon, self.world_model.action_dim)
         free = self.num_samples - self.num_proposals
-        options = {"generator": generator, "device": self.world_model.bins.device, "dtype": self.world_model.bins.dtype}
+        options = {"generator": generator, "device": device, "dtype": dtype}
         return PlanNoise(
             proposals=torch.randn(*batch_size, self.num_proposals, *actions, **options),
             candidates=torch.randn(*batch_size, self.iterations, free, *actions, **options),
@@ -305,31 +338,37 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         latent = latent.reshape(-1, latent.shape[-1])
         states = latent.shape[0]
         if noise is None:
-            noise = self.draw_noise(states)
+            noise = self.draw_noise(states, device=latent.device, dtype=latent.dtype)
         elif len(batch) != 1:
             noise = PlanNoise(*(draw.reshape(states, *draw.shape[len(batch) :]) for draw in noise))
         shape = (states, self.horizon, self.world_model.action_dim)
         start = latent.new_zeros(shape) if plan_mean is None else shift_plan(plan_mean.reshape(shape))
         gaussian = Gaussian(start, torch.full_like(start, self.std_max))
 
-        weights_cast = self._cast_weights()
-        if self.num_proposals:
-            bounds = self.proposal_log_std_bounds
-            proposals = propose_sequences(self.world_model, latent, noise.proposals, bounds)
+        search = self._search(latent, gaussian, noise, trace)
+        loc, scale, value = self._target(latent, search, noise.elite, explore)
+        action = clipped_sample(loc, scale, noise.action) if explore else loc
+        outputs = (action, loc, scale, value, search.gaussian.mean, search.fallback)
+        outputs = [field.reshape(batch + field.shape[1:]) for field in outputs]
+        if not trace:
+            return Plan(*outputs, None)
+        stacked = (torch.stack(field, dim=1) for field in zip(*search.steps, strict=True))
+        return Plan(*outputs, PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
+
+    def _search(self, latent: Tensor, gaussian: Gaussian, noise: PlanNoise, trace: bool) -> _Search:
+        """Draws candidates, scores them and refits the Gaussian, once per iteration, for states ``[B, L]``."""
+        weights_cast = self._cast_weights(latent)
+        proposals = self._proposals(latent, noise.proposals)
         steps = []
         for iteration in range(self.iterations):
             actions = sample_sequences(gaussian, noise.candidates[:, iteration])
-            if not self.num_proposals:
-                scores, returns = self._evaluate(latent, actions, weights_cast)
-            elif iteration == 0:
+            if iteration == 0:
                 actions = torch.cat([proposals, actions], dim=1)
                 scores, returns = self._evaluate(latent, actions, weights_cast)
-                proposal_scores, proposal_returns = (x[:, : self.num_proposals] for x in (scores, returns))
+                proposed = proposals, scores[:, : self.num_proposals], returns[:, : self.num_proposals]
             else:  # the proposals keep the scores of the first iteration
-                scores, returns = self._evaluate(latent, actions, weights_cast)
-                actions = torch.cat([proposals, actions], dim=1)
-                scores = torch.cat([proposal_scores, scores], dim=1)
-                returns = torch.cat([proposal_returns, returns], dim=1)
+                drawn = actions, *self._evaluate(latent, actions, weights_cast)
+                actions, scores, returns = (torch.cat(pair, dim=1) for pair in zip(proposed, drawn, strict=True))
             elites = select_elites(actions, scores, self.num_elites)
             weights = elite_weights(elites.scores, self.inverse_temperature)
             fitted = fit_gaussian(elites.actions, weights, std_min=self.std_min, std_max=self.std_max)
@@ -338,39 +377,41 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             gaussian = Gaussian(*(torch.where(keep, old, new) for old, new in zip(gaussian, fitted, strict=True)))
             if trace:
                 steps.append(PlanTrace(actions, scores, returns, *gaussian))
+        return _Search(gaussian, elites, weights, fallback, steps)
 
-        loc, value = self._choose(
-            elites.actions[:, :, 0], elites.scores, weights, gaussian.mean[:, 0], noise.elite, explore
-        )
+    def _proposals(self, latent: Tensor, noise: Tensor) -> Tensor:
+        """The policy's sequences ``[B, P, H, A]``."""
+        if not self.num_proposals:
+            return noise
+        return propose_sequences(self.world_model, latent, noise, self.proposal_log_std_bounds)
+
+    def _target(self, latent: Tensor, search: _Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean ``[B, A]``, standard deviation ``[B, A]`` and value ``[B]`` of the target; on fallback the policy's."""
+        loc, value = self._choose(search, uniform, explore)
         policy_mean, policy_log_std = self.world_model.policy(latent)
         policy_std = policy_log_std.exp().clamp(self.std_min, self.std_max)
+        fallback = search.fallback
         loc = torch.where(fallback.unsqueeze(-1), policy_mean, loc)
-        scale = torch.where(fallback.unsqueeze(-1), policy_std, gaussian.std[:, 0])
-        value = torch.where(fallback, torch.nan, value)
-        action = clipped_sample(loc, scale, noise.action) if explore else loc
-        outputs = [
-            field.reshape(batch + field.shape[1:]) for field in (action, loc, scale, value, gaussian.mean, fallback)
-        ]
-        if not trace:
-            return Plan(*outputs, None)
-        stacked = (torch.stack(field, dim=1) for field in zip(*steps, strict=True))
-        return Plan(*outputs, PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
+        scale = torch.where(fallback.unsqueeze(-1), policy_std, search.gaussian.std[:, 0])
+        return loc, scale, torch.where(fallback, torch.nan, value)
 
-    def _choose(
-        self, first: Tensor, scores: Tensor, weights: Tensor, mean: Tensor, uniform: Tensor, explore: bool
-    ) -> tuple[Tensor, Tensor]:
-        """First action ``[B, A]`` and value ``[B]`` of the chosen sequence, from the elites' ``[B, K, A]``."""
+    def _choose(self, search: _Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor]:
+        """First action ``[B, A]`` and value ``[B]`` of the chosen sequence."""
+        # Departure from the thesis, whose formula has the fitted mean, and from BMPC, which draws an elite in every
+        # mode: the texts disagree, so it is a choice; the best candidate acts in evaluation.
         choice = self.first_action if explore else self.eval_first_action
+        first, scores = search.elites.actions[:, :, 0], search.elites.scores
         if choice == "mean":
-            return mean, (weights * torch.where(scores.isfinite(), scores, 0)).sum(-1)
+            return search.gaussian.mean[:, 0], (search.weights * torch.where(scores.isfinite(), scores, 0)).sum(-1)
         if choice == "best":
             return first[:, 0], scores[:, 0]
-        index = sample_elite(weights, uniform).unsqueeze(-1)
+        index = sample_elite(search.weights, uniform).unsqueeze(-1)
         action = first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1]))
         return action.squeeze(1), scores.gather(1, index).squeeze(1)
 
-    def _cast_weights(self) -> dict[str, Tensor] | None:
-        if self.scoring_dtype is None:
+    def _cast_weights(self, latent: Tensor) -> dict[str, Tensor] | None:
+        """The weights in the scoring dtype, or ``None`` where that is their own."""
+        if self.scoring_dtype is None or self.scoring_dtype == latent.dtype:
             return None
         return {name: weight.to(self.scoring_dtype) for name, weight in self._imagination.named_parameters()}
 
@@ -378,7 +419,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self, latent: Tensor, actions: Tensor, weights_cast: dict[str, Tensor] | None
     ) -> tuple[Tensor, Tensor]:
         """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]`` from ``[B, L]``."""
-        options = {"discount": self.discount, "all_depths": getattr(self.score, "depths", "all") != "last"}
+        options = {"discount": self.discount, "all_depths": self.score.depths == "all"}
         if weights_cast is None:
             returns = self._imagination(latent, actions, **options)
         else:
@@ -393,12 +434,75 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         return scores, returns
 
 
+class _Search(NamedTuple):
+    """Where the iterations ended."""
+
+    gaussian: Gaussian
+    """The last fit, ``[B, H, A]``."""
+    elites: Elites
+    """Of the last iteration."""
+    weights: Tensor
+    """Of the elites, ``[B, K]``."""
+    fallback: Tensor
+    """Whether no candidate had a finite score, ``[B]``."""
+    steps: list[PlanTrace]
+    """Every iteration, if asked for."""
+
+
 class _Imagination(nn.Module):
     """The return table as a module, so that it can be called with other weights."""
 
-    def __init__(self, world_model: nn.Module) -> None:
+    def __init__(self, world_model: PredictionModel) -> None:
         super().__init__()
         self.world_model = world_model
 
     def forward(self, latent: Tensor, actions: Tensor, *, discount: float, all_depths: bool) -> Tensor:
         return imagined_returns(self.world_model, latent, actions, discount=discount, all_depths=all_depths)
+
+
+def _check_budget(
+    horizon: int, num_samples: int, num_elites: int, num_proposals: int, iterations: int, extra_iterations: int
+) -> None:
+    for name, number in {"horizon": horizon, "iterations": iterations, "num_elites": num_elites}.items():
+        if number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}.")
+    if num_elites > num_samples:
+        raise ValueError(f"num_elites must be at most num_samples={num_samples}, got {num_elites}.")
+    if not 0 <= num_proposals < num_samples:
+        raise ValueError(f"num_proposals must be in [0, num_samples={num_samples}), got {num_proposals}.")
+    if extra_iterations < 0:
+        raise ValueError(f"extra_iterations must not be negative, got {extra_iterations}.")
+
+
+def _check_fit(discount: float, inverse_temperature: float, std_min: float, std_max: float) -> None:
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must be in (0, 1], got {discount}.")
+    if inverse_temperature < 0:
+        raise ValueError(f"inverse_temperature must not be negative, got {inverse_temperature}.")
+    if not 0 < std_min <= std_max:
+        raise ValueError(f"std_min must be in (0, std_max={std_max}], got {std_min}.")
+
+
+def _floating_dtype(dtype: torch.dtype | str | None) -> torch.dtype | None:
+    if dtype is None:
+        return None
+    if isinstance(dtype, str):
+        if dtype not in get_args(ScoringDtype):
+            raise ValueError(f"scoring_dtype must be one of {', '.join(get_args(ScoringDtype))}, got {dtype!r}.")
+        return getattr(torch, dtype)
+    if not dtype.is_floating_point:
+        raise ValueError(f"scoring_dtype must be a floating point dtype, got {dtype}.")
+    return dtype
+
+
+def _both_or_none(low: float | None, high: float | None) -> tuple[float, float] | None:
+    if low is None and high is None:
+        return None
+    if low is None or high is None:
+        raise ValueError(
+            f"proposal_log_std_min and proposal_log_std_max must be given together, got {low} and {high}; leave both "
+            "out for the policy's own bounds."
+        )
+    if low >= high:
+        raise ValueError(f"proposal_log_std_min must be below proposal_log_std_max={high}, got {low}.")
+    return low, high

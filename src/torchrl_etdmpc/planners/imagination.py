@@ -7,16 +7,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrl_etdmpc.functional import return_table
-from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.modules.prediction import PredictionModel
 
 
 def propose_sequences(
-    world_model: WorldModel, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None
+    world_model: PredictionModel, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None
 ) -> Tensor:
     """Rolls the policy; proposal p is rolled with dynamics head p mod F.
 
     Args:
-        world_model (WorldModel): policy and dynamics.
+        world_model (PredictionModel): policy and dynamics.
         latent (Tensor): states, ``[B, L]``.
         noise (Tensor): standard normal draws for the policy, ``[B, P, H, A]``.
         log_std_bounds (tuple of float, optional): of the policy's log std. Default: the policy's own.
@@ -24,7 +24,8 @@ def propose_sequences(
     Returns:
         Tensor: action sequences in [-1, 1], ``[B, P, H, A]``.
     """
-    # Departure from BMPC, which has one head: the texts on the ensemble do not say which head rolls the policy.
+    # Departure from BMPC, which has one head: round-robin, so that every head's opinion of the policy is heard at no
+    # cost; the thesis does not say which head rolls the policy.
     heads, (proposals, horizon) = world_model.num_dynamics, noise.shape[1:3]
     rounds = -(-proposals // heads)
     noise = F.pad(noise, (0, 0, 0, 0, 0, rounds * heads - proposals))
@@ -40,14 +41,14 @@ def propose_sequences(
 
 
 def imagined_returns(
-    world_model: WorldModel, latent: Tensor, actions: Tensor, *, discount: float, all_depths: bool
+    world_model: PredictionModel, latent: Tensor, actions: Tensor, *, discount: float, all_depths: bool
 ) -> Tensor:
     """Return table of candidates, each dynamics head on its own rollout (thesis Eq. 3.1).
 
     With a termination head, rewards and values are weighted by the predicted probability of being alive.
 
     Args:
-        world_model (WorldModel): dynamics, reward, values and termination.
+        world_model (PredictionModel): dynamics, reward, values and termination.
         latent (Tensor): states, ``[B, L]``.
         actions (Tensor): candidates, ``[B, N, H, A]``.
         discount (float): gamma.
@@ -56,27 +57,45 @@ def imagined_returns(
     Returns:
         Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for the last depth only.
     """
-    heads, states, horizon = world_model.num_dynamics, actions.shape[0], actions.shape[2]
-    first, latents = latent[None, :, None], []  # at the first step all heads and candidates stand on the same latent
-    for step in range(horizon):
-        latents.append(world_model.next(latents[-1] if latents else first, actions[:, :, step]))
-    depths = torch.stack(latents if all_depths else latents[-1:])  # [D, F, B, N, L]
-    values = world_model.values(depths)
+    latents = _rolled(world_model, latent, actions)
+    values = world_model.values(torch.stack(latents if all_depths else latents[-1:]))  # [D, F, B, N, V]
+    rewards = _rewards_along(world_model, latent, latents, actions)
+    alive = _survival(world_model, latents)
+    return return_table(rewards.permute(2, 3, 0, 1), values.permute(2, 3, 0, 1, 4), discount, alive)
 
-    # Rewards of all steps in one call; those of the first step do not depend on the head.
+
+def _rolled(world_model: PredictionModel, latent: Tensor, actions: Tensor) -> list[Tensor]:
+    """Latents ``[F, B, N, L]`` after each of H actions ``[B, N, H, A]``, every head on its own rollout."""
+    before, latents = latent[None, :, None], []  # at the first step all heads and candidates stand on the same latent
+    for step in range(actions.shape[2]):
+        before = world_model.next(before, actions[:, :, step])
+        latents.append(before)
+    return latents
+
+
+def _rewards_along(world_model: PredictionModel, latent: Tensor, latents: list[Tensor], actions: Tensor) -> Tensor:
+    """Reward of every step on every head's rollout, ``[H, F, B, N]``, asked of the network in one call.
+
+    The rewards of the first step do not depend on the head and are asked once.
+    """
+    heads, (states, candidates, horizon) = world_model.num_dynamics, actions.shape[:3]
     steps = actions.permute(2, 0, 1, 3)  # [H, B, N, A]
-    rows = [first[0].expand(states, actions.shape[1], -1).flatten(0, 1)]
+    rows = [latent.unsqueeze(1).expand(-1, candidates, -1).flatten(0, 1)]
     rows += [later.flatten(0, -2) for later in latents[:-1]]
     tried = [steps[0].flatten(0, 1), steps[1:].unsqueeze(1).expand(-1, heads, -1, -1, -1).flatten(0, -2)]
     rewards = world_model.reward(torch.cat(rows), torch.cat(tried))
-    per_step = states * actions.shape[1]
-    rewards = torch.cat(
+    first, later = rewards.split([states * candidates, len(rewards) - states * candidates])
+    return torch.cat(
         [
-            rewards[:per_step].view(1, 1, *actions.shape[:2]).expand(1, heads, -1, -1),
-            rewards[per_step:].view(horizon - 1, heads, *actions.shape[:2]),
+            first.view(1, 1, states, candidates).expand(1, heads, -1, -1),
+            later.view(horizon - 1, heads, states, candidates),
         ]
     )
 
+
+def _survival(world_model: PredictionModel, latents: list[Tensor]) -> Tensor | None:
+    """Probability ``[B, N, H, F]`` of being alive at each latent ``[F, B, N, L]``; ``None``: nothing terminates."""
+    # Departure from the thesis and TD-MPC2, which cut a rollout where the probability passes a threshold: as a weight,
+    # a calibrated probability counts for what it is.
     ended = [world_model.termination(latent) for latent in latents]
-    alive = None if ended[0] is None else (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1)
-    return return_table(rewards.permute(2, 3, 0, 1), values.permute(2, 3, 0, 1, 4), discount, alive)
+    return None if ended[0] is None else (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1)

@@ -1,27 +1,61 @@
 """Planner objectives: how the table of return estimates becomes the score of a candidate.
 
 A score is any callable from ``[..., D, F, V]`` (depth, dynamics head, value head) to ``[...]``. D is the horizon, or 1
-for a score whose attribute ``depths`` is ``"last"``: the planner then computes values at the last depth only.
+for a score whose attribute ``depths`` is ``"last"``: the planner then computes values at the last depth only. A plain
+function has no such attribute and gets them all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal, Protocol, get_args
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
 
 Depths = Literal["last", "all"]
+ScoreName = Literal["final", "mean", "adaptive"]
+ScoreFunction = Callable[[Tensor], Tensor]
 
 
 class Score(Protocol):
-    """Anything that reduces a return table; a plain function will do."""
+    """Reduces a return table, and says how much of it the planner has to compute.
+
+    :func:`make_score` makes one of any function.
+    """
+
+    @property
+    def depths(self) -> Depths:
+        """``"all"``, values at every depth (D is the horizon), or ``"last"``, at the last one only (D is 1)."""
+        ...
 
     def __call__(self, returns: Tensor) -> Tensor:
-        """Return estimates ``[..., D, F, V]`` to scores ``[...]``."""
+        """Return estimates ``[..., D, F, V]`` to scores ``[...]``; what is not finite ranks last."""
+        ...
+
+
+class FunctionScore(nn.Module):
+    """A function as a score that reads every depth (a module, so that weights in it move with the planner).
+
+    Args:
+        function (callable): from ``[..., D, F, V]`` to ``[...]``, with D the horizon.
+
+    >>> import torch
+    >>> FunctionScore(lambda returns: returns.amin((-3, -2, -1)))(torch.tensor([[[1.0, 3.0]], [[5.0, 7.0]]])).item()
+    1.0
+    """
+
+    depths: Depths = "all"
+
+    def __init__(self, function: ScoreFunction) -> None:
+        super().__init__()
+        self.function = function
+
+    def forward(self, returns: Tensor) -> Tensor:
+        """Calls the function."""
+        return self.function(returns)
 
 
 def lower_confidence_bound(returns: Tensor, beta: float) -> Tensor:
@@ -97,25 +131,27 @@ class AdaptiveScore:
     def __post_init__(self) -> None:
         if self.beta < 0:
             raise ValueError(
-                f"the adaptive score needs beta >= 0, got {self.beta}; use 'final' or 'mean' for optimism."
+                f"beta must not be negative with the adaptive score, got {self.beta}; score='final' and score='mean' "
+                "take a negative one, for optimism."
             )
 
     def __call__(self, returns: Tensor) -> Tensor:
         return adaptive_mixture(ensemble_mean(returns), ensemble_variance(returns).sqrt(), self.beta)[0]
 
 
-SCORES: dict[str, Callable[..., Score]] = {"final": FinalScore, "mean": MeanScore, "adaptive": AdaptiveScore}
+SCORES: dict[ScoreName, Callable[..., Score]] = {"final": FinalScore, "mean": MeanScore, "adaptive": AdaptiveScore}
 
 
-def make_score(score: str | Score, beta: float = 0.0) -> Score:
-    """A score by name, or the user's own callable unchanged.
+def make_score(score: ScoreName | Score | ScoreFunction, beta: float = 0.0) -> Score:
+    """A score by name, or of the user's own callable.
 
     Args:
-        score (str or callable): ``"final"``, ``"mean"``, ``"adaptive"`` or a callable.
+        score (str or callable): ``"final"``, ``"mean"``, ``"adaptive"``, a :class:`Score`, which is returned unchanged,
+            or a callable without ``depths``, e.g. a function, which is given all of them.
         beta (float): penalty of a named score; a callable carries its own.
 
     Raises:
-        ValueError: if the name is unknown, or beta is given beside a callable.
+        ValueError: if the name or the callable's ``depths`` is unknown, or beta is given beside a callable.
 
     >>> make_score("mean", 10.0)
     MeanScore(beta=10.0)
@@ -123,7 +159,11 @@ def make_score(score: str | Score, beta: float = 0.0) -> Score:
     if callable(score):
         if beta:
             raise ValueError(f"beta={beta} has no effect on a score of your own; put the penalty into the callable.")
+        if not hasattr(score, "depths"):
+            return FunctionScore(score)
+        if score.depths not in get_args(Depths):
+            raise ValueError(f"depths of a score must be one of {', '.join(get_args(Depths))}, got {score.depths!r}.")
         return score
-    if score not in SCORES:
-        raise ValueError(f"score must be one of {', '.join(SCORES)} or a callable, got {score!r}.")
+    if score not in get_args(ScoreName):
+        raise ValueError(f"score must be one of {', '.join(get_args(ScoreName))} or a callable, got {score!r}.")
     return SCORES[score](beta=float(beta))

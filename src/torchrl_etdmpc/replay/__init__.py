@@ -2,6 +2,6 @@
 
 from torchrl_etdmpc.replay.journal import ReplayJournal
 from torchrl_etdmpc.replay.reanalyze import ReanalyzeTransform
-from torchrl_etdmpc.replay.slices import StepSliceSampler
+from torchrl_etdmpc.replay.slices import StepSliceSampler, UniformOver
 
-__all__ = ["ReanalyzeTransform", "ReplayJournal", "StepSliceSampler"]
+__all__ = ["ReanalyzeTransform", "ReplayJournal", "StepSliceSampler", "UniformOver"]

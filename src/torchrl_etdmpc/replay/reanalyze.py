@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
@@ -9,7 +11,9 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import ExplorationType, Transform
 from torchrl.envs.utils import set_exploration_type
 
-TARGETS = ("loc", "scale", "value", "version")
+from torchrl_etdmpc.keys import OBSERVATION, PLAN, TARGETS, VERSION
+
+_COUNTS = ("samples", "refreshed", "stale", "target_age")
 
 
 class ReanalyzeTransform(Transform):
@@ -34,11 +38,15 @@ class ReanalyzeTransform(Transform):
         observation_key (NestedKey): Default: ``"observation"``.
         plan_key (NestedKey): root of ``loc``, ``scale``, ``value`` and ``version``. Default: ``"plan"``.
 
+    The counts below are the transform's state: they are in its ``state_dict``, and so in that of the buffer.
+
     Attributes:
         enabled (bool): whether samples are re-planned; pretraining on random data turns it off.
+        samples (int): samples that took their turn, so far.
         refreshed (int): rows whose target was renewed in the buffer, so far (every copy in a sample counts).
         stale (int): rows that had been overwritten before their new target arrived, so far.
-        target_age (Tensor): mean age, in updates, of the targets of the last sample before it was refreshed.
+        target_age (Tensor, optional): mean age, in updates, of the targets of the last refreshed sample, before it
+            was refreshed. ``None`` before the first one.
 
     Raises:
         ValueError: if an argument is out of range.
@@ -59,8 +67,8 @@ class ReanalyzeTransform(Transform):
         slice_len: int,
         interval: int,
         num_slices: int = 20,
-        observation_key: NestedKey = "observation",
-        plan_key: NestedKey = "plan",
+        observation_key: NestedKey = OBSERVATION,
+        plan_key: NestedKey = PLAN,
     ) -> None:
         for name, number in {"slice_len": slice_len, "interval": interval, "num_slices": num_slices}.items():
             if number < 1:
@@ -79,6 +87,15 @@ class ReanalyzeTransform(Transform):
         self.refreshed = 0
         self.stale = 0
         self.target_age: Tensor | None = None
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The counts, as plain values and one tensor."""
+        return {name: getattr(self, name) for name in _COUNTS}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores :meth:`get_extra_state`."""
+        for name in _COUNTS:
+            setattr(self, name, state[name])
 
     def attach(self, replay_buffer: TensorDictReplayBuffer) -> ReanalyzeTransform:
         """Appends the transform to a buffer, after checking that the buffer can take the write-back.
@@ -156,7 +173,7 @@ class ReanalyzeTransform(Transform):
         with set_exploration_type(ExplorationType.RANDOM):
             planned = self.planner(states)
         planned = planned.select(*self.plan_keys.values()).to(observation.device)
-        age = planned.get(self.plan_keys["version"]) - tensordict.get(self.plan_keys["version"])[:rows]
+        age = planned.get(self.plan_keys[VERSION]) - tensordict.get(self.plan_keys[VERSION])[:rows]
         self.target_age = age.float().mean()
         patch = {key: planned.get(key)[original] for key in self.plan_keys.values()}
         result = buffer.update_if_present(index=index, generation=generation, patch=patch)

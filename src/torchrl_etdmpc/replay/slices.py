@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -11,6 +11,8 @@ from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage, TensorStorage
+
+from torchrl_etdmpc.keys import TRAJECTORY
 
 UniformOver = Literal["episodes", "starts"]
 
@@ -79,13 +81,13 @@ class StepSliceSampler(Sampler):
         self,
         slice_len: int,
         *,
-        traj_key: NestedKey = ("collector", "traj_ids"),
+        traj_key: NestedKey = TRAJECTORY,
         uniform_over: UniformOver = "episodes",
     ) -> None:
         if slice_len < 1:
             raise ValueError(f"slice_len must be at least 1, got {slice_len}.")
-        if uniform_over not in ("episodes", "starts"):
-            raise ValueError(f"uniform_over must be 'episodes' or 'starts', got {uniform_over!r}.")
+        if uniform_over not in get_args(UniformOver):
+            raise ValueError(f"uniform_over must be one of {', '.join(get_args(UniformOver))}, got {uniform_over!r}.")
         self.slice_len = slice_len
         self.traj_key = unravel_key(traj_key)
         self.uniform_over = uniform_over
@@ -99,12 +101,12 @@ class StepSliceSampler(Sampler):
         self._open: dict[int, int] = {}  # trajectory id -> its last segment
 
     def add(self, index: int) -> None:
-        """Called by the replay buffer after one row was written."""
+        """Is called by the replay buffer after one row was written."""
         self._written += 1
         self._newest = index
 
     def extend(self, index: Tensor) -> None:
-        """Called by the replay buffer after several rows were written."""
+        """Is called by the replay buffer after several rows were written."""
         self._written += len(index)
         self._newest = index[-1]
 
@@ -184,6 +186,13 @@ class StepSliceSampler(Sampler):
         return column[rows].reshape(-1).tolist()
 
     def _append(self, count: int, trajectory: int, oldest: int) -> None:
+        """Adds write number ``count`` to the last segment of its trajectory, or opens a new segment with it."""
+        # A segment is an arithmetic progression of write numbers. Its second row sets the stride (how many environments
+        # write in turn), and a row that does not continue the progression begins a new segment: a stride that changes
+        # in mid-episode costs the few slices across the seam, and no slice can skip a row.
+        # A lone row may set a stride only while it is still stored: then every row after it is stored too and was seen,
+        # so this one is its successor. Once it is overwritten, rows between the two may have come and gone unseen, and
+        # the stride would be wrong. A longer segment needs no such check, because its next write number is known.
         position = self._open.get(trajectory)
         if position is not None:
             start, stride, length, _ = self._segments.table[:, position]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
+from torchrl_etdmpc.keys import ACTION, DONE, NEXT, OBSERVATION, PLAN, REWARD, TARGETS, TERMINATED
+
 
 def random_slices(
     observation_dim: int, action_dim: int, *, num_slices: int = 4, slice_len: int = 3, terminated: bool = False
@@ -28,21 +30,23 @@ def random_slices(
     flags = torch.zeros(num_slices, slice_len, 1, dtype=torch.bool)
     if terminated:
         flags[::2, -1] = True
+    action = torch.rand(num_slices, slice_len, action_dim) * 2 - 1
+    fields = (  # in the order of TARGETS
+        torch.rand(num_slices, slice_len, action_dim) * 2 - 1,
+        torch.rand(num_slices, slice_len, action_dim) + 0.1,
+        torch.randn(num_slices, slice_len, 1),
+        torch.zeros(num_slices, slice_len, 1, dtype=torch.int64),
+    )
     return TensorDict(
         {
-            "observation": observations[:, :-1],
-            "action": torch.rand(num_slices, slice_len, action_dim) * 2 - 1,
-            "plan": {
-                "loc": torch.rand(num_slices, slice_len, action_dim) * 2 - 1,
-                "scale": torch.rand(num_slices, slice_len, action_dim) + 0.1,
-                "value": torch.randn(num_slices, slice_len, 1),
-                "version": torch.zeros(num_slices, slice_len, 1, dtype=torch.int64),
-            },
-            "next": {
-                "observation": observations[:, 1:],
-                "reward": torch.rand(num_slices, slice_len, 1),
-                "terminated": flags,
-                "done": flags.clone(),
+            OBSERVATION: observations[:, :-1],
+            ACTION: action,
+            PLAN: dict(zip(TARGETS, fields, strict=True)),
+            NEXT: {
+                OBSERVATION: observations[:, 1:],
+                REWARD: torch.rand(num_slices, slice_len, 1),
+                TERMINATED: flags,
+                DONE: flags.clone(),
             },
         },
         batch_size=[num_slices, slice_len],

@@ -1,7 +1,7 @@
 """Analytic worlds: exact functions in the place of the learned networks, so that the best plan is known.
 
-They have the prediction interface of :class:`torchrl_etdmpc.modules.WorldModel`, so ``LatentEnv(LineWorld())`` drives a
-planner, and an objective of one's own can be held against the optimum.
+Each is a :class:`~torchrl_etdmpc.modules.PredictionModel`, so ``LatentEnv(LineWorld())`` drives a planner, and an
+objective of one's own can be held against the optimum.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torchrl_etdmpc.functional import bounded_log_std, clipped_sample
 
 
 class AnalyticWorld(nn.Module):
-    """Prediction interface of the world model around exact functions; a subclass says what happens and what is best.
+    """A ``PredictionModel`` of exact functions; a subclass says what happens and what is best.
 
     The observation is the state. Head i of the dynamics adds ``drift[i]`` to the true next state and value head j adds
     ``value_offset[j]`` to the true value, so that the disagreement of the ensemble is known.
@@ -34,6 +34,10 @@ class AnalyticWorld(nn.Module):
     Raises:
         ValueError: if the errors of the heads have another shape.
     """
+
+    drift: Tensor
+    value_offset: Tensor
+    version: Tensor
 
     def __init__(
         self,
@@ -62,7 +66,6 @@ class AnalyticWorld(nn.Module):
             if error.shape != shape:
                 raise ValueError(f"{name} must have one row per head, shape {shape}, got {tuple(error.shape)}.")
             self.register_buffer(name, error)
-        self.register_buffer("bins", torch.linspace(-10.0, 10.0, 101))  # planners take device and dtype from here
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
 
     @abstractmethod

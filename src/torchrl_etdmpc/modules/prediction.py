@@ -1,0 +1,122 @@
+"""What planning needs to know of a world: the Protocol between world models and everything that imagines with them."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+
+
+@runtime_checkable
+class PredictionModel(Protocol):
+    """A world model as the planner, the imagined environment and the exporters see it.
+
+    Any ``torch.nn.Module`` with these members can be planned over: ``EnsembleMPPIPlanner(LatentEnv(model))``. A model
+    without an ensemble has ``num_dynamics = 1`` and a last dimension of size 1 in ``values``. Every method takes any
+    leading batch ``...``, on the device and in the dtype of its input, and none of them draws random numbers.
+    :class:`~torchrl_etdmpc.modules.WorldModel` is the learned one; :mod:`torchrl_etdmpc.testing` has exact ones, which
+    are short to read. The losses train the networks of a ``WorldModel`` and need more than this.
+
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> isinstance(LineWorld(), PredictionModel)
+    True
+    """
+
+    observation_dim: int
+    """O, size of the flat observation."""
+    action_dim: int
+    """A; every action lies in [-1, 1]."""
+    latent_dim: int
+    """L, size of the state in which everything is predicted."""
+    num_dynamics: int
+    """F, dynamics heads."""
+    version: Tensor
+    """How many updates made these weights: a scalar, int64. It is stamped on every target; a model that is not trained
+    has a zero."""
+
+    def encode(self, observation: Tensor) -> Tensor:
+        """Observation ``[..., O]`` to latent ``[..., L]``."""
+        ...
+
+    def next(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Steps every dynamics head on its own latent.
+
+        Args:
+            latent (Tensor): ``[F, ..., L]``, or ``[1, ..., L]`` where all heads start from the same latent; a further
+                dimension of size 1 stands for many actions in one latent.
+            action (Tensor): broadcastable to ``[F, ..., A]``.
+
+        Returns:
+            Tensor: ``[F, ..., L]``.
+        """
+        ...
+
+    def reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Expected reward of ``action [..., A]`` in ``latent [..., L]``, shape ``[...]``."""
+        ...
+
+    def values(self, latent: Tensor) -> Tensor:
+        """Expected discounted return from ``latent [..., L]`` on, by each of V value heads, shape ``[..., V]``."""
+        ...
+
+    def termination(self, latent: Tensor) -> Tensor | None:
+        """Probability that the episode terminated on reaching ``latent [..., L]``, shape ``[...]``.
+
+        ``None``, for every latent, where nothing ever terminates.
+        """
+        ...
+
+    def policy(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation of the policy in ``latent [..., L]``, both of shape ``[..., A]``.
+
+        The planner takes its proposals from here, and its action where no candidate has a finite score.
+
+        Args:
+            latent (Tensor): ``[..., L]``.
+            log_std_bounds (tuple of float, optional): other bounds of the log std for this call; a policy that has no
+                bounds may ignore them.
+        """
+        ...
+
+    def act(self, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None) -> Tensor:
+        """An action ``[..., A]`` of the policy, from standard normal ``noise [..., A]``; ``[-1, 1]``."""
+        ...
+
+
+def require_prediction_model(model: object) -> None:
+    """Checks that an object is a module with every member of :class:`PredictionModel`.
+
+    Raises:
+        TypeError: naming what is missing.
+    """
+    members = (*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_")))
+    missing = [name for name in members if not hasattr(model, name)]
+    if missing:
+        raise TypeError(
+            f"world_model must have the members of PredictionModel, got {type(model).__name__} without "
+            f"{', '.join(missing)}; see torchrl_etdmpc.modules.PredictionModel."
+        )
+    if not isinstance(model, nn.Module):
+        raise TypeError(f"world_model must be a torch.nn.Module, got {type(model).__name__}; derive it from nn.Module.")
+
+
+def device_and_dtype(
+    model: nn.Module, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+) -> tuple[torch.device, torch.dtype]:
+    """Where a model's inputs go: device and dtype of its first floating-point parameter or buffer.
+
+    Args:
+        model (nn.Module): of one device and one dtype.
+        device (torch.device or str, optional): for a model without parameters and buffers. Default: PyTorch's own.
+        dtype (torch.dtype, optional): for such a model. Default: PyTorch's own.
+
+    >>> device_and_dtype(nn.Linear(3, 2).double())
+    (device(type='cpu'), torch.float64)
+    """
+    for tensors in (model.parameters(), model.buffers()):
+        for tensor in tensors:
+            if tensor.is_floating_point():
+                return tensor.device, tensor.dtype
+    device = torch.get_default_device() if device is None else torch.device(device)
+    return device, torch.get_default_dtype() if dtype is None else dtype

@@ -1,0 +1,105 @@
+"""The world model as a TorchRL environment, so that any TorchRL planner can drive it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import ModelBasedEnvBase
+
+from torchrl_etdmpc.keys import ACTION, DONE, LATENT, OBSERVATION, REWARD, TERMINATED
+from torchrl_etdmpc.modules.prediction import PredictionModel, device_and_dtype, require_prediction_model
+
+
+class LatentEnv(ModelBasedEnvBase):
+    """Imagined environment whose observation is the latent, for any batch of states (it is not batch-locked).
+
+    A step rolls the chosen dynamics head; the reward is the expected one and the episode terminates where the model, if
+    it predicts termination, says so with a probability above one half.
+
+    The world model is shared, not copied, and stays on its device.
+
+    Args:
+        world_model (PredictionModel): the networks, an ``nn.Module``, e.g. a
+            :class:`~torchrl_etdmpc.modules.WorldModel`.
+
+    Keyword Args:
+        head (int, optional): dynamics head to roll. Default: ``None``, the average of all heads' predictions.
+        device (torch.device or str, optional): for a model without parameters and buffers; of any other the device is
+            known. Default: PyTorch's own.
+        dtype (torch.dtype, optional): the same. Default: PyTorch's own.
+
+    Raises:
+        TypeError: if the model lacks a member of :class:`~torchrl_etdmpc.modules.PredictionModel`.
+        ValueError: if ``head`` does not exist.
+
+    >>> from torchrl_etdmpc.modules import WorldModel
+    >>> env = LatentEnv(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
+    >>> start = TensorDict({"observation": torch.zeros(5, 3)}, batch_size=[5])
+    >>> env.rollout(4, tensordict=env.reset(start), auto_reset=False)["latent"].shape
+    torch.Size([5, 4, 16])
+    """
+
+    world_model: PredictionModel
+
+    def __init__(
+        self,
+        world_model: PredictionModel,
+        *,
+        head: int | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        require_prediction_model(world_model)
+        if head is not None and not 0 <= head < world_model.num_dynamics:
+            raise ValueError(f"head must be in 0..{world_model.num_dynamics - 1} or None, got {head}.")
+        device, dtype = device_and_dtype(world_model, device, dtype)
+        super().__init__(world_model, device=device)
+        self.head = head
+        like = {"device": device, "dtype": dtype}
+        size = (world_model.latent_dim,)
+        self.observation_spec = Composite({LATENT: Unbounded(size, **like)})
+        self.state_spec = Composite({LATENT: Unbounded(size, **like)})
+        self.action_spec = Bounded(-1.0, 1.0, shape=(world_model.action_dim,), **like)
+        self.reward_spec = Unbounded((1,), **like)
+
+    def device_and_dtype(self) -> tuple[torch.device, torch.dtype]:
+        """Where observations and latents go now: those of the world model, which may have been moved or cast."""
+        spec = self.observation_spec[LATENT]
+        return device_and_dtype(self.world_model, spec.device, spec.dtype)
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+        """Starts from ``latent`` or encodes ``observation`` if given; from an all-zero observation otherwise."""
+        model = self.world_model
+        if tensordict is None or (LATENT not in tensordict.keys() and OBSERVATION not in tensordict.keys()):
+            batch_size = self.batch_size if tensordict is None else tensordict.batch_size
+            device, dtype = self.device_and_dtype()
+            latent = model.encode(torch.zeros(*batch_size, model.observation_dim, device=device, dtype=dtype))
+        elif LATENT in tensordict.keys():
+            batch_size, latent = tensordict.batch_size, tensordict.get(LATENT)
+        else:
+            batch_size, latent = tensordict.batch_size, model.encode(tensordict.get(OBSERVATION))
+        done = torch.zeros(*batch_size, 1, dtype=torch.bool, device=latent.device)
+        return TensorDict({LATENT: latent, DONE: done, TERMINATED: done.clone()}, batch_size=batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        model = self.world_model
+        latent, action = tensordict.get(LATENT), tensordict.get(ACTION)
+        heads = model.next(latent.unsqueeze(0), action)
+        following = heads.mean(0) if self.head is None else heads[self.head]
+        ended = model.termination(following)
+        done = torch.zeros_like(action[..., :1], dtype=torch.bool) if ended is None else (ended > 0.5).unsqueeze(-1)
+        return TensorDict(
+            {
+                LATENT: following,
+                REWARD: model.reward(latent, action).unsqueeze(-1),
+                DONE: done,
+                TERMINATED: done.clone(),
+            },
+            batch_size=tensordict.batch_size,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass  # deterministic
