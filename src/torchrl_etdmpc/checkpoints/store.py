@@ -107,7 +107,9 @@ class CheckpointStore:
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
             replay = self.journal.save(buffer, version=version)
-            files = {name: write_tensors(partial / f"{name}.pt", dict(part.state_dict())) for name, part in parts.items()}
+            files = {
+                name: write_tensors(partial / f"{name}.pt", dict(part.state_dict())) for name, part in parts.items()
+            }
             write_whole(partial / "manifest.json", json.dumps({"format": FORMAT, "files": files, "replay": replay}))
             for path, name in (links or {}).items():  # before the checkpoint: its parts may say that this was done
                 link(partial / f"{name}.pt", path)

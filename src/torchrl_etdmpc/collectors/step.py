@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
-from torchrl_etdmpc.keys import TRAJECTORY as TRAJ_KEY
+from torchrl_etdmpc.keys import TRAJECTORY
 from torchrl_etdmpc.runs.errors import first_line
 
 Insertion = Literal["step", "episode"]
@@ -209,17 +209,17 @@ class StepCollector(BaseCollector):
     def _start(self, tensordict: TensorDictBase) -> TensorDictBase:
         ids = torch.arange(self.num_envs) + self._next_trajectory
         self._next_trajectory += self.num_envs
-        return tensordict.set(TRAJ_KEY, ids.reshape(tensordict.batch_size))
+        return tensordict.set(TRAJECTORY, ids.reshape(tensordict.batch_size))
 
     def _next_carrier(self, carrier: TensorDictBase, stepped: TensorDictBase) -> TensorDictBase:
-        ids, done = stepped.get(TRAJ_KEY), stepped.get(("next", "done"))
+        ids, done = stepped.get(TRAJECTORY), stepped.get(("next", "done"))
         self._after_reset = bool(done.any())
         if self._after_reset:
             ids = ids.clone()
             for position in done.reshape(self.num_envs).nonzero().flatten().tolist():
                 ids.view(-1)[position] = self._next_trajectory
                 self._next_trajectory += 1
-        return carrier.set(TRAJ_KEY, ids)
+        return carrier.set(TRAJECTORY, ids)
 
     def _store(self, kept: TensorDictBase) -> None:
         if self.insertion == "step":

@@ -134,10 +134,6 @@ def build_agent(
         optim = arguments(config.optim, "batch_size", "updates_per_decision")
         updater = Updater(loss, tau=config.loss.tau, compile_mode=compile_mode, **optim)
     common = {"discount": discount, "compile_mode": compile_mode}
-    planner, eval_planner = (
-        build_planner(world_model, config.planner, warm_start=True, **common) for _ in range(2)
-    )
-    reanalyze_planner = build_planner(
-        world_model, config.reanalyze, warm_start=False, group="reanalyze", **common
-    )
+    planner, eval_planner = (build_planner(world_model, config.planner, warm_start=True, **common) for _ in range(2))
+    reanalyze_planner = build_planner(world_model, config.reanalyze, warm_start=False, group="reanalyze", **common)
     return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater, compile_mode)

@@ -96,9 +96,7 @@ def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayB
     return reanalyze.attach(replay)
 
 
-def build_collector(
-    config: TrainConfig, agent: Agent, env: EnvBase, replay: TensorDictReplayBuffer
-) -> StepCollector:
+def build_collector(config: TrainConfig, agent: Agent, env: EnvBase, replay: TensorDictReplayBuffer) -> StepCollector:
     """The collector with its random phase, on an environment with ``config.num_envs`` rows."""
     return StepCollector(
         env,

@@ -25,7 +25,6 @@ from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
 
 
-
 @dataclass(frozen=True)
 class ModelConfig:
     """Sizes of the networks (thesis Table A.1); see :class:`~torchrl_etdmpc.modules.WorldModel`."""

@@ -132,9 +132,7 @@ class Evaluator:
     def _play(self, policy: nn.Module, on_step: Callable[[TensorDictBase], None] | None) -> Tensor:
         torch.manual_seed(self.seed)
         self.env.set_seed(self.seed)
-        return evaluate(
-            self.env, policy, episodes=self.episodes, policy_device=self.agent.device, on_step=on_step
-        )
+        return evaluate(self.env, policy, episodes=self.episodes, policy_device=self.agent.device, on_step=on_step)
 
     def close(self) -> None:
         """Closes the environment."""

@@ -151,7 +151,9 @@ class Learner:
         in_a_row = int(self.agent.updater.skipped_in_a_row)
         if in_a_row < self.config.max_skipped:
             return
-        broken = [name for name, value in row.items() if name.startswith(("loss_", "grad_")) and not math.isfinite(value)]
+        broken = [
+            name for name, value in row.items() if name.startswith(("loss_", "grad_")) and not math.isfinite(value)
+        ]
         raise NonFiniteError(
             f"the last {in_a_row} updates had no finite gradient and were skipped; not finite are {', '.join(broken)}. "
             "A lower optim.lr or optim.grad_clip_norm may help."

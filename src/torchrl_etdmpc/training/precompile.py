@@ -17,9 +17,7 @@ from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig
 
 
-def precompile(
-    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]
-) -> float:
+def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]) -> float:
     """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
 
     With ``compile=auto`` a failure to compile is a warning, and the run goes on without.
