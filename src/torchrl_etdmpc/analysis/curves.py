@@ -69,7 +69,7 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
         FileNotFoundError: a file is missing.
         ValueError: a file is not what it should be, or counts steps in other units.
     """
-    header, table = readread_header(run_dir), read_evaluations(run_dir)
+    header, table = read_header(run_dir), read_evaluations(run_dir)
     _check_units(table.assign(task=header["task"]), RunDirectory(run_dir).eval)
     return pd.DataFrame(
         {
