@@ -3,10 +3,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import importlib.util
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +20,8 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_etdmpc.envs import DMC_TASKS, get_task, make_dmc_env, render_frame
+from torchrl_etdmpc.envs import DMC_TASKS, get_task, make_dmc_env
+from torchrl_etdmpc.envs.dmc import domain_and_task
 
 pytest.importorskip("dm_control")
 
@@ -75,8 +72,7 @@ def _raw_env(name: str, seed: int):
     """The dm_control environment itself, in the state in which make_dmc_env(name, seed=seed).reset() leaves it."""
     from dm_control import suite
 
-    task = get_task(name)
-    env = suite.load(task.domain, task.task, task_kwargs={"random": np.random.RandomState(seed)})
+    env = suite.load(*domain_and_task(name), task_kwargs={"random": np.random.RandomState(seed)})
     env.reset()  # TorchRL resets once when it seeds
     return env
 
@@ -186,10 +182,8 @@ def test_an_early_end_terminates_and_ends_the_action_repeat(monkeypatch):
 
 @pytest.mark.parametrize("name", ["walker-walk", "quadruped-walk"])
 def test_the_environment_is_torchrls_with_transforms(name):
-    task = get_task(name)
-    base = DMControlEnv(
-        task.domain, task.task, frame_skip=2, device="cpu", environment_kwargs={"flat_observation": True}
-    )
+    names, options = domain_and_task(name), {"flat_observation": True}
+    base = DMControlEnv(*names, frame_skip=2, device="cpu", environment_kwargs=options)
     # On the way in transforms apply from last to first, so actions are scaled in float64.
     transforms = [RenameTransform(["observations"], ["observation"]), DoubleToFloat(), InitTracker(), RewardSum()]
     reference = TransformedEnv(base, Compose(*([ActionScaling()] if "quadruped" in name else []), *transforms))
@@ -213,6 +207,28 @@ def test_the_episode_reward_starts_over_with_each_episode():
 def test_the_action_repeat_comes_from_the_task():
     task = dataclasses.replace(get_task("pendulum-swingup"), action_repeat=4)
     assert make_dmc_env(task, seed=0).rollout(600).shape == (task.decision_steps_per_episode,) == (250,)
+
+
+def test_the_episode_length_comes_from_the_task():
+    env = make_dmc_env(get_task("pendulum-swingup", episode_length=25), seed=0)
+    rollout = env.rollout(600)
+    assert rollout.shape == (13,)  # the last decision is one env step
+    assert rollout["next", "truncated"][-1].item()
+    assert env.rollout(600).shape == (13,)
+
+
+@pytest.mark.parametrize(
+    ("name", "names"),
+    [
+        ("cup-catch", ("ball_in_cup", "catch")),
+        ("cartpole-balance-sparse", ("cartpole", "balance_sparse")),
+        ("cartpole-swingup-sparse", ("cartpole", "swingup_sparse")),
+        ("finger-turn-easy", ("finger", "turn_easy")),
+        ("dog-trot", ("dog", "trot")),
+    ],
+)
+def test_names_map_to_the_suites_own_names(name, names):
+    assert domain_and_task(name) == names
 
 
 @pytest.mark.parametrize("end", [-1.0, 0.0, 1.0])
@@ -289,52 +305,6 @@ def test_parallel_environments_have_seeds_of_their_own_and_repeat(two_walkers):
     assert torch.equal(first, again)
     assert not torch.equal(first[0], first[1])
     assert torch.equal(first[0], make_dmc_env("walker-walk", seed=5).reset()["observation"])
-
-
-def test_rendering_a_batch_of_environments_is_refused(two_walkers):
-    with pytest.raises(ValueError, match=r"^render_frame needs one environment made by make_dmc_env, got ParallelEnv"):
-        render_frame(two_walkers)
-
-
-@pytest.mark.parametrize("size", [(0, 64), (64, 10_000)])
-def test_a_frame_beyond_the_models_limit_is_refused(size):
-    env = make_dmc_env("pendulum-swingup", seed=0)
-    with pytest.raises(ValueError, match=r"^frames of pendulum must be 1 to 480 pixels high and 1 to 640 wide, got"):
-        render_frame(env, *size)
-
-
-@pytest.mark.parametrize("backend", ["disable", None])
-def test_a_process_that_cannot_render_says_so_in_one_line(backend, monkeypatch):
-    env = make_dmc_env("pendulum-swingup", seed=0)
-
-    def fail(**kwargs):
-        raise RuntimeError("No OpenGL rendering\nbackend is available.")
-
-    monkeypatch.setattr(type(env.physics), "render", fail)
-    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    if backend:
-        monkeypatch.setenv("MUJOCO_GL", backend)
-    with pytest.raises(RuntimeError, match="^cannot render: .*; set MUJOCO_GL=egl before Python starts") as error:
-        render_frame(env)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.slow
-def test_a_frame_is_a_uint8_image_of_the_asked_size():
-    script = (
-        "from torchrl_etdmpc.envs import make_dmc_env, render_frame\n"
-        "env = make_dmc_env('quadruped-walk', seed=0)\n"
-        "env.reset()\n"
-        "frame = render_frame(env, height=48, width=64)\n"
-        "print(tuple(frame.shape), frame.dtype, bool(frame.float().std() > 1))\n"
-    )
-    source = str(Path(__file__).parents[2] / "src")
-    environment = os.environ | {"MUJOCO_GL": "egl", "PYTHONPATH": source}
-    run = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
-    if run.returncode:
-        pytest.skip(f"no EGL on this machine: {run.stderr.strip().splitlines()[-1]}")
-    assert run.stdout.strip() == "(48, 64, 3) torch.uint8 True"
 
 
 def test_making_an_environment_prints_nothing(capfd):

@@ -1,25 +1,30 @@
 from __future__ import annotations
 
+import importlib.util
 import io
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs import ActionScaling, EnvBase, GymEnv, StepCounter, TransformedEnv
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 pytest.importorskip("dm_control")
 
 from torchrl_etdmpc import SeedPolicy, StepCollector  # noqa: E402
-from torchrl_etdmpc.envs import load_simulator_state, make_dmc_env, simulator_state  # noqa: E402
+from torchrl_etdmpc.envs import get_task, load_simulator_state, simulator_state  # noqa: E402
+from torchrl_etdmpc.envs import make_env as make_any_env  # noqa: E402
 
 LIMIT = 9
+needs_gym = pytest.mark.skipif(importlib.util.find_spec("gymnasium") is None, reason="needs gymnasium")
+needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("imageio") is None, reason="needs gymnasium[mujoco]")
 
 
 def make_env(task: str, num_envs: int, *, parallel: bool, seed: int = 3) -> EnvBase:
     """Episodes of nine steps; the last transform is outside the workers."""
-    return make_dmc_env(task, seed=seed, num_envs=num_envs, parallel=parallel).append_transform(StepCounter(LIMIT))
+    return make_any_env(task, seed=seed, num_envs=num_envs, parallel=parallel).append_transform(StepCounter(LIMIT))
 
 
 def step(env: EnvBase, carrier: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -46,6 +51,9 @@ def through_a_file(state):
         ("reacher-easy", 1, False),  # a target drawn at every reset
         ("humanoid-run", 1, False),
         ("finger-spin", 1, False),
+        pytest.param("gym/Pendulum-v1", 1, False, marks=needs_gym),
+        pytest.param("gym/Pendulum-v1", 2, True, marks=needs_gym),
+        pytest.param("gym/Hopper-v5", 3, False, marks=needs_mujoco),
     ],
 )
 @pytest.mark.parametrize("steps", [4, 2 * LIMIT + 3])
@@ -68,6 +76,106 @@ def test_another_environment_goes_on_where_the_first_one_was(task, num_envs, par
         assert (stepped == wanted).all()
     first.close()
     second.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "resets"),
+    [
+        pytest.param("gym/Pendulum-v1", 170, 1, marks=needs_gym),
+        pytest.param("gym/InvertedPendulum-v5", 33, 5, marks=needs_mujoco),  # falls often
+        pytest.param("gym/Hopper-v5", 30, 1, marks=needs_mujoco),
+        ("pendulum-swingup", 470, 1),
+    ],
+)
+def test_an_episode_goes_on_to_its_own_end_and_into_the_next_ones(name, steps, resets):
+    first, second = (make_any_env(get_task(name), seed=seed) for seed in (3, 4))
+    torch.manual_seed(0)
+    carrier = first.reset()
+    for _ in range(steps):
+        _, carrier = step(first, carrier)
+    state, resumed = through_a_file(simulator_state(first)), carrier.clone()
+    assert 0 < len(state["_extra_state"]["actions"])  # in the middle of an episode
+    second.rollout(5)  # in another one
+    assert load_simulator_state(second, state)
+    seen = 0
+    for _ in range(60):
+        action = torch.rand(first.action_spec.shape) * 2 - 1
+        wanted, carrier = first.step_and_maybe_reset(carrier.set("action", action))
+        stepped, resumed = second.step_and_maybe_reset(resumed.set("action", action))
+        assert (stepped == wanted).all()
+        assert (resumed == carrier).all()
+        seen += wanted["next", "done"].item()
+    assert seen >= resets
+
+
+@needs_gym
+def test_the_state_that_a_seeded_reset_began_with_is_kept():
+    first, second = (make_any_env("gym/Pendulum-v1") for _ in range(2))
+    start = first.reset(seed=7)["observation"]
+    assert torch.equal(start, GymEnv("Pendulum-v1").reset(seed=7)["observation"])
+    assert load_simulator_state(second, simulator_state(first))
+    assert torch.equal(first.reset()["observation"], second.reset()["observation"])
+
+
+@needs_gym
+def test_a_simulator_of_gymnasium_that_behaves_otherwise_is_noticed():
+    first, second = (make_any_env("gym/Pendulum-v1", seed=0) for _ in range(2))
+    first.rollout(3)
+    second._env.unwrapped.g = 5.0
+    assert not load_simulator_state(second, simulator_state(first))
+
+
+@needs_gym
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_a_simulator_of_gymnasium_without_a_known_random_state_says_that_it_cannot_be_restored(num_envs):
+    def make(unrepeatable: bool) -> EnvBase:
+        env = make_any_env("gym/Pendulum-v1", num_envs=num_envs, parallel=False)
+        if unrepeatable:
+            env.reset()  # starts several environments
+            for single in getattr(env, "_envs", [env]):
+                single._env.unwrapped.np_random = np.random.Generator(np.random.MT19937(0))
+        env.reset()
+        return env
+
+    state = simulator_state(make(False))
+    assert state is not None
+    assert simulator_state(make(True)) is None
+    assert not load_simulator_state(make(False), None)
+
+
+@needs_gym
+def test_what_is_registered_as_nondeterministic_cannot_be_restored():
+    import gymnasium
+
+    gymnasium.register(
+        "Random-v0", gymnasium.registry["Pendulum-v1"].entry_point, max_episode_steps=9, nondeterministic=True
+    )
+    try:
+        env = make_any_env("gym/Random-v0")
+        env.reset()
+        assert simulator_state(env) is None
+    finally:
+        del gymnasium.registry["Random-v0"]
+
+
+@needs_gym
+def test_a_reset_with_options_cannot_be_repeated_and_the_next_one_can():
+    env = make_any_env("gym/Pendulum-v1")
+    env.reset(options={"x_init": 0.1, "y_init": 0.1})
+    assert simulator_state(env) is None
+    env.reset()
+    assert simulator_state(env) is not None
+
+
+def test_an_environment_before_its_first_reset_has_nothing_to_come_back_to():
+    assert simulator_state(make_any_env("pendulum-swingup")) is None
+
+
+@needs_gym
+def test_torchrls_own_gymnasium_environments_say_that_they_cannot_be_restored():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
+    env.reset()
+    assert simulator_state(env) is None
 
 
 def test_a_simulator_that_behaves_otherwise_is_noticed():

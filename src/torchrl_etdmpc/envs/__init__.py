@@ -1,11 +1,14 @@
-"""Environments: the benchmark tasks as TorchRL environments, and the world model as one."""
+"""Real environments: any task as a TorchRL environment, by one door with a written contract."""
 
 from __future__ import annotations
 
-from torchrl_etdmpc.envs.dmc import make_dmc_env, render_frame
+from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.latent import LatentEnv
-from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task
+from torchrl_etdmpc.envs.make import make_dmc_env, make_env
+from torchrl_etdmpc.envs.render import render_frame
+from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, register_task
+from torchrl_etdmpc.envs.user_task import import_task
 
 __all__ = [
     "DMC_TASKS",
@@ -13,9 +16,13 @@ __all__ = [
     "HARD_DMC",
     "LatentEnv",
     "Task",
+    "check_env",
     "get_task",
+    "import_task",
     "load_simulator_state",
     "make_dmc_env",
+    "make_env",
+    "register_task",
     "render_frame",
     "simulator_state",
 ]

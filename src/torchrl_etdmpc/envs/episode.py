@@ -1,7 +1,8 @@
-"""DeepMind Control environments that can be saved in the middle of an episode, by what led there."""
+"""Simulators that can be saved in the middle of an episode, by what led there."""
 
 from __future__ import annotations
 
+import abc
 from typing import Any
 
 import numpy as np
@@ -9,106 +10,109 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import DMControlEnv, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-__all__ = ["RecordedDMControlEnv", "load_simulator_state", "simulator_state"]
+__all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
 
 
-# The name that dm_control gives to its own concatenation of a task's observations.
-_FLAT_OBSERVATION = "observations"
+class RecordedEnv(EnvBase):
+    """What the environments of all suites share: their entries, and a record of the running episode.
 
+    A simulator's full state is spread over its parts; but an episode follows from the random state before its reset
+    and from the actions since, so those are kept (some tens of kilobytes). That place is the environment's extra
+    state, so it is in its ``state_dict`` and in that of a TorchRL environment of several copies.
 
-class RecordedDMControlEnv(DMControlEnv):
-    """A :class:`~torchrl.envs.DMControlEnv` that remembers how its episode came to be where it is.
-
-    MuJoCo's full state is spread over the physics, the task and dm_control's own counters; but an episode follows from
-    the task's random state before its reset and from the actions since, so those are kept (some tens of kilobytes).
-
-    That place is the environment's extra state, so it is in its ``state_dict`` and in that of a TorchRL environment of
-    several copies.
-
-    It writes one float32 ``observation`` (dm_control's ``flat_observation``, which must be on), ``is_init`` and
-    ``episode_reward`` itself and takes actions in [-1, 1], so that a step goes through no transforms.
+    It writes one float32 ``observation``, ``is_init`` and ``episode_reward`` itself and takes actions in [-1, 1], so
+    that a step goes through no transforms. A suite's class puts this one in front of TorchRL's wrapper of the suite.
     """
 
-    _before_reset: tuple | None = None
+    _random: Tensor | None = None  # as it was before the reset; None: nothing to come back to
     _actions: list[np.ndarray]
     _episode_reward: Tensor
 
-    def _make_specs(self, env: Any) -> None:
-        super()._make_specs(env)
+    @abc.abstractmethod
+    def _advance(self, action: np.ndarray) -> tuple[Any, float, bool, bool]:
+        """One env step: the suite's own observation, reward, terminated, truncated."""
+
+    @abc.abstractmethod
+    def _random_state(self, **kwargs: Any) -> Tensor | None:
+        """From which a reset with ``kwargs`` draws; ``None`` if it cannot be repeated."""
+
+    @abc.abstractmethod
+    def _set_random_state(self, state: Tensor) -> None:
+        """Brings :meth:`_random_state` back."""
+
+    @abc.abstractmethod
+    def _fingerprint(self) -> np.ndarray:
+        """Numbers that tell whether a repeated episode led to the same place."""
+
+    def _write_specs(self, observation_size: int, low: np.ndarray, high: np.ndarray) -> None:
+        """The specs, all but those of the flags; ``low`` and ``high`` bound the suite's own actions, float64 [A]."""
         self.observation_spec = Composite(
-            observation=self.observation_spec[_FLAT_OBSERVATION].to(torch.float32),
+            observation=Unbounded(observation_size, dtype=torch.float32),
             is_init=Binary(1, dtype=torch.bool),
             episode_reward=Unbounded(1),
             device=self.device,
         )
-        self.reward_spec = self.reward_spec.to(torch.float32)
-        bounds = env.action_spec()
-        self._middle, self._half_width = (bounds.maximum + bounds.minimum) / 2, (bounds.maximum - bounds.minimum) / 2
-        self.action_spec = Bounded(-1, 1, shape=bounds.shape, dtype=torch.float32, device=self.device)
-
-    def read_obs(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
-        """dm_control's flat observation as a float32 tensor."""
-        return {"observation": torch.from_numpy(observations[_FLAT_OBSERVATION].astype(np.float32))}
+        self.reward_spec = Unbounded(1, dtype=torch.float32, device=self.device)
+        self._middle, self._half_width = (high + low) / 2, (high - low) / 2
+        self.action_spec = Bounded(-1, 1, shape=low.shape, dtype=torch.float32, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        self._before_reset = self._env.task.random.get_state()
-        self._actions = []
+        self._random, self._actions = self._random_state(**kwargs), []
         self._episode_reward = torch.zeros(1)
         first = super()._reset(tensordict, **kwargs)
         return first.update({"is_init": torch.ones(1, dtype=torch.bool), "episode_reward": self._episode_reward})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._middle + self._half_width * tensordict.get(self.action_key).numpy(force=True)  # float64
-        timestep, reward = self._decide(action)
-        truncated = timestep.last() and timestep.discount == 1
+        observation, reward, terminated, truncated = self._decide(action)
         flags = {
             "is_init": False,
             "truncated": truncated,
-            "terminated": timestep.last() and not truncated,
-            "done": timestep.last(),
+            "terminated": terminated,
+            "done": terminated or truncated,
         }
         return TensorDict(
-            self.read_obs(timestep.observation)
+            self.read_obs(observation)
             | {"reward": reward, "episode_reward": self._episode_reward}
             | {name: torch.full((1,), bool(flag)) for name, flag in flags.items()},
             batch_size=self.batch_size,
             device=self.device,
         )
 
-    def _decide(self, action: np.ndarray) -> tuple[Any, Tensor]:
-        """The last time step of an action that is repeated, and the sum of the rewards on the way."""
+    def _decide(self, action: np.ndarray) -> tuple[Any, Tensor, bool, bool]:
+        """The last env step of an action that is repeated, with the sum of the rewards on the way."""
         self._actions.append(action)
         total = 0.0
         for _ in range(self.wrapper_frame_skip):
-            timestep = self._env.step(action)
-            total += timestep.reward
-            if timestep.last():
+            observation, reward, terminated, truncated = self._advance(action)
+            total += reward
+            if terminated or truncated:
                 break
         reward = torch.tensor([total], dtype=torch.float32)
         self._episode_reward = self._episode_reward + reward
-        return timestep, reward
+        return observation, reward, terminated, truncated
 
-    def get_extra_state(self) -> dict[str, Tensor]:
-        """Random state before the reset, the actions since, and a fingerprint of the physics that they led to."""
-        if self._before_reset is None:
-            return {}
+    def get_extra_state(self) -> dict[str, Tensor] | None:
+        """Random state before the reset, the actions since, and a fingerprint of the place that they led to."""
+        if self._random is None:
+            return None
         return {
-            "random": _pack(self._before_reset),
+            "random": self._random,
             "actions": torch.from_numpy(np.array(self._actions).reshape(-1, *self.action_spec.shape)),
-            "physics": torch.from_numpy(self.physics.get_state().copy()),
+            "fingerprint": torch.from_numpy(np.array(self._fingerprint())),
         }
 
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+    def set_extra_state(self, state: dict[str, Tensor] | None) -> None:
         """Goes through the episode again.
 
         Afterwards :meth:`get_extra_state` equals ``state`` if the simulator is as deterministic here as it was there.
         """
-        if not state:
+        if state is None:
             return
-        self._env.task.random.set_state(_unpack(state["random"]))
+        self._set_random_state(state["random"])
         self._reset()
         for action in state["actions"].numpy():
             self._decide(action.copy())
@@ -125,11 +129,21 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
     """
     state = _simulator(env).state_dict()
     workers = list(state.values()) if isinstance(_simulator(env), BatchedEnvBase) else [state]
-    return dict(state) if all("_extra_state" in worker for worker in workers) else None
+    return dict(state) if all(worker.get("_extra_state") is not None for worker in workers) else None
 
 
-def load_simulator_state(env: EnvBase, state: dict[str, Any]) -> bool:
-    """Brings the environment to a saved place; ``False`` if it did not get there exactly."""
+def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
+    """Brings the environment to a saved place; ``False`` if it did not get there exactly.
+
+    Args:
+        env (EnvBase): made as the one that was saved.
+        state (dict, optional): of :func:`simulator_state`; ``None`` is ``False``.
+
+    Returns:
+        bool: whether the environment is where the saved one was, to the last bit.
+    """
+    if state is None:
+        return False
     simulator = _simulator(env)
     simulator.load_state_dict(state)
     # TorchRL 0.14: a ParallelEnv's workers report that they are done twice, and the next step would not wait for them.
@@ -151,16 +165,3 @@ def _equal(one: Any, other: Any) -> bool:
     if isinstance(one, dict):
         return isinstance(other, dict) and one.keys() == other.keys() and all(_equal(one[k], other[k]) for k in one)
     return torch.equal(one, other) if isinstance(one, Tensor) else one == other
-
-
-def _pack(state: tuple) -> Tensor:
-    """NumPy's random state as integers; the cached normal number by its bits."""
-    _, keys, position, has_gauss, cached = state
-    tail = np.array([position, has_gauss, np.float64(cached).view(np.int64)], dtype=np.int64)
-    return torch.from_numpy(np.concatenate([keys.astype(np.int64), tail]))
-
-
-def _unpack(packed: Tensor) -> tuple:
-    values = packed.numpy()
-    keys, (position, has_gauss, cached) = values[:-3].astype(np.uint32), values[-3:]
-    return "MT19937", keys, int(position), int(has_gauss), float(cached.view(np.float64))

@@ -1,41 +1,48 @@
-"""The benchmark tasks by name: which suite, how long an episode is, how often an action repeats."""
+"""Tasks by name: which suite, how long an episode is, how often an action repeats, whether episodes end early."""
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
-from dataclasses import dataclass
+import importlib.util
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, Literal, Protocol
 
-__all__ = ["DMC_TASKS", "EASY_DMC", "HARD_DMC", "Task", "get_task"]
+import torch
+from torchrl.envs import EnvBase
+
+__all__ = ["DMC_TASKS", "EASY_DMC", "HARD_DMC", "Maker", "Task", "get_task", "register_task"]
 
 
 @dataclass(frozen=True)
 class Task:
-    """A benchmark task and the numbers that fix its protocol.
+    """A task and the numbers that fix its protocol.
 
     Args:
-        name: the name by which commands and result tables know the task, e.g. ``"walker-walk"``.
-        suite: the library that simulates it, e.g. ``"dm_control"``.
-        domain: the suite's name of the body, e.g. ``"walker"``.
-        task: the suite's name of the goal, e.g. ``"walk"``.
-        action_repeat: env steps per decision, at least 1. One decision's reward is the sum over its env steps.
-        episode_length: the suite's own time limit, in env steps, at least 1.
+        name (str): the name by which commands and result tables know the task, e.g. ``"walker-walk"``.
+        suite (str): the library that simulates it, e.g. ``"dm_control"`` or ``"gymnasium"``; any word for a task with a
+            maker of its own.
+        action_repeat (int): env steps per decision, at least 1. One decision's reward is the sum over its env steps.
+        episode_length (int): the time limit, in env steps, at least 1.
+        terminates (bool): whether an episode can end for another reason than the time limit. The world model then
+            learns to predict it.
+        observation (str): what an observation is. Only vectors are supported now.
 
     Raises:
         ValueError: if ``action_repeat`` or ``episode_length`` is below 1.
 
-    Examples:
-        >>> from torchrl_etdmpc.envs import Task
-        >>> task = Task("swimmer6", "dm_control", "swimmer", "swimmer6", action_repeat=2, episode_length=1000)
-        >>> task.decision_steps_per_episode
-        500
+    >>> task = Task("swimmer-swimmer6", "dm_control", action_repeat=2, episode_length=1000, terminates=False)
+    >>> task.decision_steps_per_episode
+    500
     """
 
     name: str
     suite: str
-    domain: str
-    task: str
-    action_repeat: int
+    _: KW_ONLY
+    action_repeat: int = 1
     episode_length: int
+    terminates: bool = True
+    observation: Literal["vector", "pixels", "dictionary"] = "vector"
 
     def __post_init__(self) -> None:
         for field in ("action_repeat", "episode_length"):
@@ -46,6 +53,12 @@ class Task:
     def decision_steps_per_episode(self) -> int:
         """Decisions in a full episode; the last one is shorter if the action repeat does not divide the episode."""
         return -(-self.episode_length // self.action_repeat)
+
+
+class Maker(Protocol):
+    """Makes one environment of a task, batch size []."""
+
+    def __call__(self, task: Task, *, device: torch.device | str) -> EnvBase: ...
 
 
 EASY_DMC: tuple[str, ...] = (
@@ -87,47 +100,108 @@ HARD_DMC: tuple[str, ...] = (
 DMC_TASKS: tuple[str, ...] = EASY_DMC + HARD_DMC
 """All 28 DeepMind Control tasks."""
 
-# The benchmark tables shorten one domain name.
-_DMC_DOMAINS = {"cup": "ball_in_cup"}
+# Gymnasium's registry does not say which tasks never terminate; in the source of gymnasium 1.4 the `step` of these, in
+# every version, always returns terminated=False. (MountainCarContinuous, for one, terminates at its goal.)
+_GYMNASIUM_NEVER_TERMINATES = {"Pendulum", "HalfCheetah", "HumanoidStandup", "Pusher", "Reacher", "Swimmer"}
+
+_tasks = {name: Task(name, "dm_control", action_repeat=2, episode_length=1000, terminates=False) for name in DMC_TASKS}
+_makers: dict[str, Maker] = {}
 
 
-def _dmc_task(name: str) -> Task:
-    domain, _, task = name.partition("-")
-    return Task(
-        name=name,
-        suite="dm_control",
-        domain=_DMC_DOMAINS.get(domain, domain),
-        task=task.replace("-", "_"),
-        action_repeat=2,
-        episode_length=1000,
+def register_task(task: Task, make: Maker | None = None, *, replace: bool = False) -> None:
+    """Makes a task known to :func:`get_task` and :func:`~torchrl_etdmpc.envs.make_env` under its name.
+
+    Args:
+        task (Task): the task.
+        make (callable, optional): ``make(task, device=...)`` returns one TorchRL environment, batch size [], that keeps
+            the contract of :func:`~torchrl_etdmpc.envs.check_env`; ``is_init`` and ``episode_reward`` are added where
+            they are missing. It obeys the task's ``action_repeat`` and ``episode_length``, which a command may have
+            changed. ``None`` leaves it to the task's suite. With several environments it is called in worker processes,
+            so it must be importable there, or picklable.
+        replace (bool): whether another task of this name makes room.
+
+    Raises:
+        ValueError: if the name belongs to another task, or to the same one with another maker.
+
+    >>> from torchrl_etdmpc.envs import Task, get_task, register_task
+    >>> register_task(Task("swimmer-swimmer6", "dm_control", action_repeat=2, episode_length=1000, terminates=False))
+    >>> get_task("swimmer-swimmer6").decision_steps_per_episode
+    500
+    """
+    known = task.name in _tasks and (_tasks[task.name], _makers.get(task.name)) != (task, make)
+    if known and not replace:
+        raise ValueError(f"task {task.name!r} is registered already, as something else; choose another name.")
+    _tasks[task.name] = task
+    _makers.pop(task.name, None)
+    if make is not None:
+        _makers[task.name] = make
+
+
+def registered_maker(task: Task) -> Maker | None:
+    """The maker that was registered under the task's name, if any."""
+    return _makers.get(task.name)
+
+
+def get_task(
+    name: str,
+    *,
+    action_repeat: int | None = None,
+    episode_length: int | None = None,
+    terminates: bool | None = None,
+) -> Task:
+    """Looks a task up by its name; never imports a user's code.
+
+    Args:
+        name (str): one of :data:`DMC_TASKS`, a name that :func:`register_task` knows, or ``gym/`` and any id of
+            Gymnasium, e.g. ``"gym/Pendulum-v1"``.
+        action_repeat (int, optional): instead of the task's own; likewise the next two.
+        episode_length (int, optional): in env steps.
+        terminates (bool, optional): ``True`` for a Gymnasium task unless it is known never to terminate.
+
+    Returns:
+        Task: the task's entry, with what was given here in it.
+
+    Raises:
+        ValueError: if no task has this name (the message holds the nearest names), if the name is a path to code
+            (``package.module:attribute``) that :func:`~torchrl_etdmpc.envs.import_task` has not followed, if Gymnasium
+            sets no time limit and ``episode_length`` is not given, or if a number is below 1.
+        ImportError: if a Gymnasium task is asked for without gymnasium.
+
+    >>> from torchrl_etdmpc.envs import get_task
+    >>> task = get_task("cup-catch")
+    >>> task.suite, task.action_repeat, task.decision_steps_per_episode
+    ('dm_control', 2, 500)
+    >>> get_task("cup-catch", episode_length=200).decision_steps_per_episode
+    100
+    """
+    told: dict[str, Any] = {"action_repeat": action_repeat, "episode_length": episode_length, "terminates": terminates}
+    told = {field: value for field, value in told.items() if value is not None}
+    if name in _tasks:
+        return dataclasses.replace(_tasks[name], **told)
+    if str(name).startswith("gym/"):
+        return _gymnasium_task(name, told)
+    if ":" in str(name):
+        # A stored run or checkpoint may hold such a name, and no file may make us import code.
+        raise ValueError(f"task {name!r} names code, which must be given on the command line: task={name}")
+    nearest = difflib.get_close_matches(str(name), _tasks, n=3)
+    hint = f"did you mean {', '.join(nearest)}? " if nearest else ""
+    raise ValueError(
+        f"unknown task {name!r}; {hint}All names: torchrl_etdmpc.envs.DMC_TASKS, and gym/<id> for Gymnasium's."
     )
 
 
-_TASKS = {name: _dmc_task(name) for name in DMC_TASKS}
+def _gymnasium_task(name: str, told: dict[str, Any]) -> Task:
+    if importlib.util.find_spec("gymnasium") is None:
+        raise ImportError(f"task {name!r} needs gymnasium, which is missing; run: pip install torchrl_etdmpc[gym]")
+    import gymnasium
 
-
-def get_task(name: str) -> Task:
-    """Looks a task up by its name.
-
-    Args:
-        name: one of :data:`DMC_TASKS`.
-
-    Returns:
-        The task's entry.
-
-    Raises:
-        ValueError: if no task has this name; the message holds the nearest names.
-
-    Examples:
-        >>> from torchrl_etdmpc.envs import get_task
-        >>> task = get_task("cup-catch")
-        >>> task.domain, task.task, task.action_repeat, task.decision_steps_per_episode
-        ('ball_in_cup', 'catch', 2, 500)
-        >>> get_task("cartpole-balance-sparse").task
-        'balance_sparse'
-    """
-    if name in _TASKS:
-        return _TASKS[name]
-    nearest = difflib.get_close_matches(str(name), _TASKS, n=3)
-    hint = f"did you mean {', '.join(nearest)}? " if nearest else ""
-    raise ValueError(f"unknown task {name!r}; {hint}All names: torchrl_etdmpc.envs.DMC_TASKS.")
+    env_id = name.removeprefix("gym/")
+    if env_id not in gymnasium.registry:
+        nearest = difflib.get_close_matches(env_id, gymnasium.registry, n=3)
+        hint = f"did you mean {', '.join(f'gym/{other}' for other in nearest)}? " if nearest else ""
+        raise ValueError(f"unknown task {name!r}; {hint}All ids: gymnasium.registry.")
+    limit = gymnasium.registry[env_id].max_episode_steps
+    if limit is None and "episode_length" not in told:
+        raise ValueError(f"Gymnasium sets no time limit for {env_id}; give one in env steps: task.episode_length=")
+    terminates = env_id.rpartition("-v")[0] not in _GYMNASIUM_NEVER_TERMINATES
+    return Task(name, "gymnasium", **({"episode_length": limit, "terminates": terminates} | told))

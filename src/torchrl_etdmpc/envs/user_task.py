@@ -1,0 +1,163 @@
+"""Tasks in a user's own file, by the path to the code."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter, Transform, TransformedEnv
+
+from torchrl_etdmpc.envs.make import find_maker
+from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
+
+__all__ = ["import_task"]
+
+
+def import_task(
+    path: str,
+    *,
+    action_repeat: int | None = None,
+    episode_length: int | None = None,
+    terminates: bool | None = None,
+) -> Task:
+    """Imports a user's own task and registers it under its path.
+
+    This is the only place that follows a path to code. The path must come from the person who started the program,
+    never from a file.
+
+    Args:
+        path (str): ``package.module:attribute``; the module is looked for on Python's path and in the current
+            directory. The attribute is a function without arguments that returns one TorchRL environment, with any
+            transforms; or a :class:`~torchrl_etdmpc.envs.Task`, which its suite makes or the maker that the module
+            registered with it.
+        action_repeat (int, optional): env steps per decision. A function's environment repeats actions itself if it
+            has to, so here it can only be told what is true.
+        episode_length (int, optional): the time limit in env steps; a function's environment without one, or with a
+            longer one, is truncated there. Needed where the environment does not show a limit (a
+            :class:`~torchrl.envs.StepCounter`, or a Gymnasium environment's own).
+        terminates (bool, optional): whether an episode can end for another reason than the time limit; ``True`` for a
+            function unless told.
+
+    Returns:
+        Task: the task, with the path as its name.
+
+    Raises:
+        ValueError: if nothing can be found there, or if it is not a task or an environment.
+
+    >>> import_task("no.such.module:make")
+    Traceback (most recent call last):
+        ...
+    ValueError: task 'no.such.module:make': there is no module 'no.such.module' on Python's path or in ...
+    """
+    told: dict[str, Any] = {"action_repeat": action_repeat, "episode_length": episode_length, "terminates": terminates}
+    told = {field: value for field, value in told.items() if value is not None}
+    found = _follow(path)
+    if isinstance(found, Task):
+        maker: Maker = partial(_make_as, found.name, find_maker(found))
+        task = dataclasses.replace(found, name=path, **told)
+    else:
+        maker = partial(_make_limited, found)
+        env = _call(found, path)
+        repeat, limit = _action_repeat(env), _limit(env)
+        env.close()
+        if limit is None and "episode_length" not in told:
+            raise ValueError(f"task {path!r} shows no time limit; give one in env steps: task.episode_length=")
+        task = Task(path, "user", **({"action_repeat": repeat, "episode_length": limit} | told))
+        _require_agreement(task, repeat, limit)
+    register_task(task, maker, replace=True)
+    return task
+
+
+def _follow(path: str) -> Any:
+    module_name, _, attribute = path.partition(":")
+    if not module_name or not attribute:
+        raise ValueError(f"task {path!r} must read package.module:attribute.")
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.append(here)  # for good: the user's code may import more, later and in worker processes
+    importlib.invalidate_caches()
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise  # the user's module was found, and misses another one
+        raise ValueError(f"task {path!r}: there is no module {module_name!r} on Python's path or in {here}.") from error
+    found = getattr(module, attribute, None)
+    if found is None:
+        where = getattr(module, "__file__", None) or "built in"
+        raise ValueError(f"task {path!r}: the module {module_name!r} ({where}) has no {attribute!r}.")
+    if not (callable(found) or isinstance(found, Task)):
+        raise ValueError(f"task {path!r} must be a function or a Task, got {type(found).__name__}.")
+    return found
+
+
+def _make_as(name: str, make: Maker, task: Task, *, device: torch.device | str) -> EnvBase:
+    """Calls a maker with the name that the task had in its own module."""
+    return make(dataclasses.replace(task, name=name), device=device)
+
+
+def _make_limited(function: Callable[[], EnvBase], task: Task, *, device: torch.device | str) -> EnvBase:
+    """A function's environment, which must be what the task says it is."""
+    env = _call(function, task.name)
+    repeat, limit = _action_repeat(env), _limit(env)
+    _require_agreement(task, repeat, limit)
+    if limit is None or task.episode_length < limit:
+        # Under a name of its own, beside a StepCounter that the environment may have.
+        env = env.append_transform(StepCounter(task.decision_steps_per_episode, step_count_key="decision_count"))
+    return env.to(device)
+
+
+def _require_agreement(task: Task, repeat: int, limit: int | None) -> None:
+    if task.action_repeat != repeat:
+        raise ValueError(
+            f"action_repeat of task {task.name!r} must be {repeat}, which is how often its environment repeats an "
+            f"action, got {task.action_repeat}; repeat actions inside the function."
+        )
+    if limit is not None and task.episode_length > limit:
+        raise ValueError(
+            f"episode_length of task {task.name!r} must be at most {limit}, its environment's own limit, got "
+            f"{task.episode_length}."
+        )
+
+
+def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
+    env = function()
+    if not isinstance(env, EnvBase):
+        raise ValueError(f"task {path!r} must return a TorchRL environment, got {type(env).__name__}.")
+    return env
+
+
+def _action_repeat(env: EnvBase) -> int:
+    """Env steps per step of this environment, as far as its layers tell."""
+    repeat = 1
+    for layer in _layers(env):
+        # Of an environment that cannot repeat actions itself, TorchRL keeps the number and appends the transform.
+        if isinstance(layer, FrameSkipTransform) or getattr(type(layer), "_has_frame_skip", False):
+            repeat *= layer.frame_skip
+    return repeat
+
+
+def _limit(env: EnvBase) -> int | None:
+    """The time limit of this environment in env steps, the least that its layers tell."""
+    limits = []
+    for layer in _layers(env):
+        if isinstance(layer, StepCounter) and layer.max_steps is not None:
+            limits.append(layer.max_steps * _action_repeat(env))
+        elif not isinstance(layer, Transform):
+            spec = getattr(getattr(layer, "_env", None), "spec", None)
+            limits.append(getattr(spec, "max_episode_steps", None))
+    return min((limit for limit in limits if limit is not None), default=None)
+
+
+def _layers(env: EnvBase) -> Iterator[EnvBase | Transform]:
+    """The environment below all transforms, and each transform."""
+    while isinstance(env, TransformedEnv):
+        yield from (layer for layer in env.transform.modules() if isinstance(layer, Transform))
+        env = env.base_env
+    yield env

@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+from torchrl.envs import StepCounter, TransformedEnv
+
+pytest.importorskip("gymnasium")
+
+from torchrl_etdmpc.envs import check_env, get_task, import_task, make_env, simulator_state  # noqa: E402
+
+_RECIPE = """
+from torchrl.envs import ActionScaling, GymEnv, TransformedEnv
+
+def make_my_env():
+    return TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
+"""
+
+_MORE = """
+import gymnasium
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, StepCounter, TransformedEnv
+from torchrl_etdmpc.envs import Task, register_task
+
+def scaled(*transforms, base=None, **options):
+    env = TransformedEnv(base or GymEnv("Pendulum-v1", **options), ActionScaling())
+    for transform in transforms:
+        env = env.append_transform(transform)
+    return env
+
+def limited(): return scaled(StepCounter(30))
+def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
+def unlimited(): return scaled(base=GymWrapper(PendulumEnv()))
+def repeats(): return scaled(frame_skip=4)
+def repeats_by_transform(): return scaled(FrameSkipTransform(4), StepCounter(10))
+def unscaled(): return GymEnv("Pendulum-v1")
+def number(): return 3
+def broken(): return 1 / 0
+VALUE = 3
+
+def maker(task, *, device):
+    assert task.name == "registered-in-a-file"
+    return scaled(StepCounter(task.decision_steps_per_episode), frame_skip=task.action_repeat)
+
+REGISTERED = Task("registered-in-a-file", "mine", episode_length=12, terminates=False)
+register_task(REGISTERED, maker, replace=True)  # the tests import this file again and again
+gymnasium.register("InAFile-v0", PendulumEnv, max_episode_steps=20)
+OF_A_SUITE = Task("gym/InAFile-v0", "gymnasium", episode_length=20, terminates=False)
+OF_NOBODY = Task("nobodys", "nobody", episode_length=20)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A user's directory, in which commands run; what they import is forgotten."""
+    (tmp_path / "my_file.py").write_text(_RECIPE)
+    (tmp_path / "more_tasks.py").write_text(_MORE)
+    (tmp_path / "misses_one.py").write_text("import a_module_that_is_not_there\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    yield tmp_path
+    if "more_tasks" in sys.modules:
+        del sys.modules["more_tasks"].gymnasium.registry["InAFile-v0"]
+    for name in ("my_file", "more_tasks", "misses_one"):
+        sys.modules.pop(name, None)
+
+
+def test_a_new_task_is_one_file_and_its_path(folder):
+    task = import_task("my_file:make_my_env")  # task=my_file:make_my_env on the command line
+    assert (task.name, task.action_repeat, task.episode_length, task.terminates) == (
+        "my_file:make_my_env",
+        1,
+        200,
+        True,
+    )
+    env = make_env(task, seed=0)
+    check_env(env)
+    rollout = env.rollout(300)
+    assert rollout.shape == (200,)
+    torch.testing.assert_close(rollout["next", "episode_reward"][-1], rollout["next", "reward"].sum(0))
+
+
+def test_a_task_that_was_imported_is_known_by_its_path(folder):
+    (folder / "known_later.py").write_text(_RECIPE)
+    with pytest.raises(ValueError, match="^task 'known_later:make_my_env' names code, which must be given on the comm"):
+        get_task("known_later:make_my_env")
+    task = import_task("known_later:make_my_env", episode_length=50)
+    assert get_task("known_later:make_my_env") == task
+    assert import_task("known_later:make_my_env").episode_length == 200  # once more, told otherwise
+
+
+@pytest.mark.parametrize("path", ["my_file:make_my_env", "more_tasks:REGISTERED", "more_tasks:OF_A_SUITE"])
+@pytest.mark.parametrize("parallel", [False, True])
+def test_several_environments_of_a_users_task(folder, path, parallel):
+    env = make_env(import_task(path), seed=0, num_envs=2, parallel=parallel)
+    assert env.rollout(5).shape == (2, 5)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "repeat", "length"), [("limited", 1, 30), ("repeats", 4, 200), ("repeats_by_transform", 4, 40)]
+)
+def test_what_an_environment_shows_is_read(folder, name, repeat, length):
+    task = import_task(f"more_tasks:{name}")
+    assert (task.action_repeat, task.episode_length) == (repeat, length)
+    assert make_env(task).rollout(1000).shape == (task.decision_steps_per_episode,)
+
+
+@pytest.mark.parametrize("name", ["unlimited", "counted"])
+def test_a_time_limit_that_is_told_ends_episodes(folder, name):
+    with pytest.raises(ValueError) as error:
+        import_task(f"more_tasks:{name}")
+    assert str(error.value) == (
+        f"task 'more_tasks:{name}' shows no time limit; give one in env steps: task.episode_length="
+    )
+    rollout = make_env(import_task(f"more_tasks:{name}", episode_length=11, terminates=False)).rollout(100)
+    assert rollout.shape == (11,)
+    assert rollout["next", "truncated"][-1].item()
+    assert not get_task(f"more_tasks:{name}").terminates
+
+
+def test_a_shorter_time_limit_is_obeyed_and_a_longer_one_refused(folder):
+    assert make_env(import_task("more_tasks:repeats", episode_length=10)).rollout(100).shape == (3,)
+    with pytest.raises(ValueError) as error:
+        import_task("more_tasks:limited", episode_length=31)
+    assert str(error.value) == (
+        "episode_length of task 'more_tasks:limited' must be at most 30, its environment's own limit, got 31."
+    )
+
+
+def test_an_action_repeat_that_is_not_there_is_refused(folder):
+    assert import_task("more_tasks:repeats", action_repeat=4).action_repeat == 4
+    with pytest.raises(ValueError, match=r"^action_repeat of task 'more_tasks:limited' must be 1, .*, got 2; repeat"):
+        import_task("more_tasks:limited", action_repeat=2)
+
+
+def test_a_task_of_a_file_keeps_its_numbers_and_maker(folder):
+    task = import_task("more_tasks:REGISTERED", action_repeat=3)
+    assert (task.name, task.suite, task.episode_length) == ("more_tasks:REGISTERED", "mine", 12)
+    assert make_env(task).rollout(100).shape == (4,)
+    of_a_suite = make_env(import_task("more_tasks:OF_A_SUITE"), seed=0)
+    assert of_a_suite.rollout(100).shape == (20,)
+    assert simulator_state(of_a_suite) is not None
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("my_file", r"task 'my_file' must read package\.module:attribute\."),
+        (":make", r"task ':make' must read package\.module:attribute\."),
+        ("my_file:", r"task 'my_file:' must read package\.module:attribute\."),
+        ("no_file:make", r"task 'no_file:make': there is no module 'no_file' on Python's path or in .*"),
+        (
+            "no.such.file:make",
+            r"task 'no\.such\.file:make': there is no module 'no\.such\.file' on Python's path or .*",
+        ),
+        ("my_file:other", r"task 'my_file:other': the module 'my_file' \(.*my_file\.py\) has no 'other'\."),
+        ("more_tasks:VALUE", r"task 'more_tasks:VALUE' must be a function or a Task, got int\."),
+        ("more_tasks:number", r"task 'more_tasks:number' must return a TorchRL environment, got int\."),
+        ("more_tasks:OF_NOBODY", r"nothing makes the suite 'nobody' of task 'nobodys'; .*"),
+    ],
+)
+def test_a_path_that_leads_nowhere_is_refused_in_one_line(folder, path, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        import_task(path)
+
+
+def test_mistakes_in_the_users_code_keep_their_own_error(folder):
+    with pytest.raises(ModuleNotFoundError, match="a_module_that_is_not_there"):
+        import_task("misses_one:make")
+    with pytest.raises(ZeroDivisionError):
+        import_task("more_tasks:broken")
+
+
+def test_what_a_users_environment_lacks_is_named(folder):
+    with pytest.raises(ValueError, match=r"^task 'more_tasks:unscaled': .* \(append ActionScaling\(\)\)\.$"):
+        make_env(import_task("more_tasks:unscaled"))
+
+
+def test_a_users_environment_cannot_be_brought_back(folder):
+    for options in ({}, {"num_envs": 2, "parallel": False}):
+        env = make_env(import_task("my_file:make_my_env"), seed=0, **options)
+        env.rollout(3)
+        assert simulator_state(env) is None
+
+
+def test_a_users_own_transforms_stay(folder):
+    env = make_env(import_task("more_tasks:limited"))
+    assert isinstance(env, TransformedEnv)
+    assert any(isinstance(transform, StepCounter) for transform in env.transform)
+    assert "step_count" in env.reset()
