@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -167,7 +167,7 @@ class ReplayJournal:
 
     def _read_rows(self, files: Mapping[str, Any]) -> TensorDictBase:
         """The rows that are still in the buffer, in the order of their writing, without their targets."""
-        rows: TensorDictBase = TensorDict.cat([self._read(entry) for entry in files["rows"]])
+        rows = cast(TensorDictBase, torch.cat([self._read(entry) for entry in files["rows"]]))
         overwritten = max(files["written"] - files["capacity"], 0) - files["rows"][0]["begin"]  # of the oldest file
         return _rows(rows, slice(overwritten, None))
 
@@ -178,7 +178,8 @@ class ReplayJournal:
             change = self._read(entry)
             begin = entry.get("begin")  # a base is a range of rows, a change lists them
             index = change.pop("index").long() if begin is None else slice(begin, begin + entry["rows"])
-            content = change.new_zeros(torch.Size([count])) if content is None else content
+            if content is None:
+                content = cast(TensorDictBase, change.new_zeros(torch.Size([count])))
             content[index] = change
         return content
 
