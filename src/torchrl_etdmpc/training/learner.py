@@ -12,6 +12,7 @@ from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.runs import IntervalMeans
 from torchrl_etdmpc.training.agent import build_agent
 from torchrl_etdmpc.training.builders import (
     build_collector,
@@ -21,7 +22,6 @@ from torchrl_etdmpc.training.builders import (
     row_bytes,
 )
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.interval_means import IntervalMeans
 
 
 class Learner:
