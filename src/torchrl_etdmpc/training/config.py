@@ -318,7 +318,7 @@ def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> 
     converted = {}
     for name, value in values.items():
         hint = hints[name]
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, Mapping), f"{prefix}{name} must be a group of settings, got {value!r}.")
             converted[name] = config_from_dict(hint, value, f"{prefix}{name}.")
         else:
@@ -330,7 +330,7 @@ def _check_types(config: Any, prefix: str = "") -> None:
     """Checks what was not made by :func:`config_from_dict`."""
     for name, hint in typing.get_type_hints(type(config)).items():
         value = getattr(config, name)
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, hint), f"{prefix}{name} must be a {hint.__name__}, got {value!r}.")
             _check_types(value, f"{prefix}{name}.")
         else:
