@@ -238,9 +238,11 @@ class TrainConfig:
     @functools.cached_property
     def task_spec(self) -> Task:
         """The task behind the name, with what this run changes about it."""
-        changes = {name: getattr(self, name) for name in ("action_repeat", "episode_length", "terminates")}
-        return dataclasses.replace(
-            get_task(self.task), **{name: value for name, value in changes.items() if value is not None}
+        return get_task(
+            self.task,
+            action_repeat=self.action_repeat,
+            episode_length=self.episode_length,
+            terminates=self.terminates,
         )
 
     @property
