@@ -72,6 +72,22 @@ def test_heads_may_take_their_own_actions(randomised):
         torch.testing.assert_close(out[i], model.next(latent, action[i])[i])
 
 
+@pytest.mark.parametrize("states", [(), (5,)])
+def test_many_actions_in_one_latent_give_what_each_candidate_gives_alone(states, randomised):
+    stack = randomised(num_dynamics=3).dynamics
+    for layer in stack.hidden:
+        assert (layer.bias.abs() > 0).all()  # or a bias that got lost would not be missed
+    latent, actions = simnorm(torch.randn(1, *states, 1, L)), torch.rand(*states, 7, A) * 2 - 1
+    out = stack(latent, actions)
+    assert out.shape == (3, *states, 7, L)
+    for i in range(3):
+        alone = MLP(L + A, [32, 32], L, output_activation=simnorm)
+        alone.load_state_dict({name: tensor[i] for name, tensor in stack.state_dict().items()})
+        for n in range(7):
+            expected = alone(torch.cat([latent[0, ..., 0, :], actions[..., n, :]], dim=-1))
+            torch.testing.assert_close(out[i, ..., n, :], expected, rtol=1e-4, atol=1e-5)
+
+
 # Dropout
 
 

@@ -96,6 +96,56 @@ def test_half_precision_leaves_the_weights_as_they_are_and_follows_them(make_pla
     assert (planner.plan(observation, noise=noise).value > first.value).all()
 
 
+def test_a_scoring_dtype_can_be_named(make_planner, make_model, states, assert_same_plan):
+    model, observation = make_model().float(), states(2).float()
+    by_name, by_dtype = (make_planner(model, scoring_dtype=dtype) for dtype in ("bfloat16", torch.bfloat16))
+    assert by_name.scoring_dtype == torch.bfloat16
+    noise = by_name.draw_noise(2)
+    assert_same_plan(by_name.plan(observation, noise=noise), by_dtype.plan(observation, noise=noise))
+
+
+def test_scoring_in_the_weights_own_dtype_is_no_other_computation(make_planner, make_model, states):
+    model, observation = make_model(), states(3)
+    plain, named = make_planner(model), make_planner(model, scoring_dtype="float64")
+    noise = plain.draw_noise(3)
+    expected, plan = (planner.plan(observation, noise=noise) for planner in (plain, named))
+    for name in Plan._fields[:-1]:
+        assert torch.equal(getattr(plan, name), getattr(expected, name)), name
+
+
+def test_a_compiled_plan_is_called_in_the_place_of_plan_and_leaves_it_alone(make_planner, states):
+    planner, td = make_planner(), TensorDict({"observation": states(3)}, batch_size=[3])
+    calls, method = [], planner.plan
+
+    def compiled(observation, plan_mean, **options):
+        calls.append(set(options))
+        return method(observation, plan_mean, **options)._replace(action=torch.full((3, 2), 0.5))
+
+    assert planner.compiled_plan is None
+    planner.compiled_plan = compiled
+    assert (planner(td.clone())["action"] == 0.5).all()
+    assert calls == [{"latent", "explore"}]
+    assert (planner.plan(td["observation"]).action != 0.5).all()
+    assert planner.plan == method
+    assert planner.state_dict().keys() == make_planner().state_dict().keys()
+    planner.compiled_plan = None
+    assert (planner(td.clone())["action"] != 0.5).any()
+    assert len(calls) == 1
+
+
+def test_a_copy_starts_without_what_was_compiled_for_the_original(make_planner, states):
+    planner, td = make_planner(), TensorDict({"observation": states(3)}, batch_size=[3])
+
+    def compiled(*inputs, **options):
+        raise AssertionError("the original's compiled plan was called")
+
+    planner.compiled_plan = compiled
+    for other in (copy.deepcopy(planner), pickle.loads(pickle.dumps(planner))):
+        assert other.compiled_plan is None
+        assert other(td.clone())["action"].isfinite().all()
+    assert planner.compiled_plan is compiled
+
+
 def test_one_compiled_graph_plans_as_eager_code_does(make_planner, states):
     # The backend runs the traced graph as it is, in double precision; only mish is written otherwise there.
     counter = CompileCounter()
