@@ -139,7 +139,7 @@ def test_a_run_that_was_warmed_up_compiles_nothing_more(warmed):
 
 @needs_compiler
 def test_compiled_updates_leave_no_memory_behind(warmed):
-    updater, batch = warmed[0].learner.agent.updater, random_slices(5, 1, num_slices=4)
+    updater, batch = warmed[0].learner.agent.updater, random_slices(5, 1, num_slices=4).contiguous()
 
     counts = []
     for _ in range(6):
@@ -156,7 +156,7 @@ def test_a_compiled_update_equals_an_eager_one(warmed, tiny_config):
     agent = warmed[0].learner.agent
     eager = build_agent(tiny_config(), 5, 1)
     eager.loss.load_state_dict(agent.loss.state_dict())
-    batch = random_slices(5, 1, num_slices=4)
+    batch = random_slices(5, 1, num_slices=4).contiguous()
     metrics, gradients = [], []
     for updater in (eager.updater, agent.updater):
         applied = []
