@@ -267,7 +267,8 @@ def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(
 
 def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, make_run, read_table):
     # The words are stored, so they outlive the code: no renaming may change what they mean.
-    run = make_run(small_config(), tmp_path)
+    config = small_config(checkpoint_every=1000)
+    run = make_run(config, tmp_path)
     for _ in range(24):
         run.learner.step()
     list(run.learner.pretrain())
@@ -282,13 +283,16 @@ def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, mak
     run.state.load_state_dict(state)
     assert run.save()
     run.log.directory.close()
-    resumed = make_run(small_config(), tmp_path, resume=True)
+    resumed = make_run(config, tmp_path, resume=True)
     restored = resumed.state.state_dict()
     assert restored.pop("wall_s") >= state.pop("wall_s")
     assert restored == state
+    done, save = [], resumed.store.save
+    resumed.store.save = lambda step, *args, **options: done.append(step) or save(step, *args, **options)
     stop_at(resumed, resumed.learner.collector, "act", 1)
     with pytest.raises(RunInterrupted):
         resumed.run()
+    assert done == [48, 50]  # because it was due, and because it was asked to stop
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [48]
     assert [row["env_steps"] for row in read_table(tmp_path / "train.csv")] == [48]
     assert resumed.state.stage == "learn"
@@ -480,13 +484,13 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     run.save()
     for _ in range(10):
         run.learner.step()
-    outcomes = []
+    outcomes, other = [], make_run(config, tmp_path / "other")  # takes every state in turn
     for moment in count(1):
         killed = killed_while_saving(run, moment)
-        resumed = make_run(config, tmp_path, resume=True)
-        outcomes.append((killed, resumed.env_steps))
-        assert len(resumed.learner.replay) == resumed.env_steps // 2
-        resumed.log.directory.close()
+        replay = build_replay(config)
+        CheckpointStore(tmp_path / "checkpoints").load(other.parts, replay)
+        outcomes.append((killed, other.env_steps))
+        assert len(replay) == other.env_steps // 2
         if not killed:
             break
     assert outcomes[0] == (True, 60)
