@@ -45,7 +45,7 @@ def _make_run(config: TrainConfig, run_dir: Path, *transforms: Transform, resume
     torch.manual_seed(99 if resume else 0)
 
     def make(num_envs: int, seed: int, *more: Transform) -> EnvBase:
-        env = make_env(config.task, seed=seed, num_envs=num_envs, parallel=False)
+        env = make_env(config.task_spec, seed=seed, num_envs=num_envs, parallel=False)
         for transform in (StepCounter(EPISODE), *more):
             env = env.append_transform(transform)
         return env

@@ -109,6 +109,7 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         (directory.begin if plan.action == "begin" else directory.go_on)(config.to_dict())
         stack.callback(directory.close)
         stack.callback(log.close)
+        directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
         try:
             log.logger = make_logger(config.logger, directory, config.to_dict())
         except BaseException:
