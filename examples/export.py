@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from torchrl_etdmpc import export_planner, export_policy
+from torchrl_etdmpc.runs.files import replacing
 from torchrl_etdmpc.training import hydra_main, load_agent
 
 
@@ -50,7 +51,8 @@ def main(config: ExportConfig) -> None:
     out = Path(config.out).expanduser()
     out.mkdir(parents=True, exist_ok=True)
     for name, program in (("policy", policy), ("planner", planner)):
-        torch.export.save(program, out / f"{name}.pt2")
+        with replacing(out / f"{name}.pt2") as partial:
+            torch.export.save(program, partial)
     print(
         f"{run.task}: {out}/policy.pt2 and {out}/planner.pt2, observations {list(observation.shape)}, actions "
         f"{list(actions[0].shape)}, plan_mean {list(plan_mean.shape)}"

@@ -133,11 +133,11 @@ def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_
         (out / name).write_text("old")
     calls = []
 
-    def save(figure, path, **options):
-        calls.append(path)
+    def save(figure, file, **options):
+        calls.append(file)
         if len(calls) == which:
             raise OSError("disk full")
-        Path(path).write_bytes(b"picture")
+        file.write(b"picture")
 
     monkeypatch.setattr(Figure, "savefig", save)
     with pytest.raises(OSError, match="disk full"):
@@ -159,7 +159,7 @@ def test_a_figure_that_fails_makes_no_report(monkeypatch, tmp_path):
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page and the tables only, which is much faster."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: Path(path).write_bytes(b""))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b""))
 
 
 def test_one_seed_is_a_mean_whose_missing_interval_the_page_explains(without_figures, tmp_path):

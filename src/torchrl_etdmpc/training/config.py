@@ -238,9 +238,11 @@ class TrainConfig:
     @functools.cached_property
     def task_spec(self) -> Task:
         """The task behind the name, with what this run changes about it."""
-        changes = {name: getattr(self, name) for name in ("action_repeat", "episode_length", "terminates")}
-        return dataclasses.replace(
-            get_task(self.task), **{name: value for name, value in changes.items() if value is not None}
+        return get_task(
+            self.task,
+            action_repeat=self.action_repeat,
+            episode_length=self.episode_length,
+            terminates=self.terminates,
         )
 
     @property
@@ -318,7 +320,7 @@ def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> 
     converted = {}
     for name, value in values.items():
         hint = hints[name]
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, Mapping), f"{prefix}{name} must be a group of settings, got {value!r}.")
             converted[name] = config_from_dict(hint, value, f"{prefix}{name}.")
         else:
@@ -330,7 +332,7 @@ def _check_types(config: Any, prefix: str = "") -> None:
     """Checks what was not made by :func:`config_from_dict`."""
     for name, hint in typing.get_type_hints(type(config)).items():
         value = getattr(config, name)
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, hint), f"{prefix}{name} must be a {hint.__name__}, got {value!r}.")
             _check_types(value, f"{prefix}{name}.")
         else:
