@@ -188,7 +188,8 @@ def test_a_compiled_agent_plans_like_an_eager_one(tiny_agent):
     for name, states in (("planner", 1), ("reanalyze_planner", 12)):
         reference, planner = getattr(eager, name), getattr(fast, name)
         observation, noise = torch.randn(states, OBSERVATION_DIM), reference.draw_noise(states)
-        expected, actual = (p.plan(observation, noise=noise) for p in (reference, planner))
+        assert reference.compiled_plan is None
+        expected, actual = (plan(observation, noise=noise) for plan in (reference.plan, planner.compiled_plan))
         for field in ("action", "loc", "scale", "value", "mean"):
             torch.testing.assert_close(getattr(actual, field), getattr(expected, field), rtol=1e-3, atol=1e-4)
         written = planner(TensorDict({"observation": observation, "is_init": torch.ones(states, 1).bool()}, [states]))
