@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
+from torchrl_etdmpc.replay.journal import DamagedFileError, ReplayJournal, read_checked, write_checked
 
 from torchrl_etdmpc.replay import journal as module
-from torchrl_etdmpc.replay.journal import DamagedFileError, ReplayJournal, read_checked, write_checked
 
 
 def make_buffer(capacity: int = 50) -> TensorDictReplayBuffer:

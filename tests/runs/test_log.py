@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-
-from torchrl_etdmpc.training import run_log
 from torchrl_etdmpc.training.curve import plot_curve
 from torchrl_etdmpc.training.run_lock import lock_run, unlock_run
 from torchrl_etdmpc.training.run_log import RunLog
 from torchrl_etdmpc.training.versions import library_versions
+
+from torchrl_etdmpc.training import run_log
 
 CONFIG = {"task": "walker-walk", "preset": "efficient-tdmpc-utd4", "seed": 1, "planner": {"horizon": 3, "lr": 3e-4}}
 COUNTERS = {"env_steps": 1000, "decision_steps": 500, "updates": 400, "wall_time_s": 9.5}

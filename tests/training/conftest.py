@@ -54,9 +54,12 @@ def _make_run(config: TrainConfig, run_dir: Path, *transforms: Transform, resume
     log = RunLog(directory, total_env_steps=config.total_env_steps)
     env = make(config.num_envs, 90 if resume else 0, *transforms)
     run = TrainingRun(config, env=env, eval_env=make(config.eval_episodes, 1), log=log)
-    (directory.go_on if resume else directory.begin)(config.to_dict())
     if resume:
+        directory.go_on()
         run.resume()
+        directory.write_config(config.to_dict())
+    else:
+        directory.begin(config.to_dict())
     return run
 
 

@@ -4,7 +4,6 @@ import io
 
 import pytest
 import torch
-
 from torchrl_etdmpc.training.interval_means import IntervalMeans
 
 

@@ -197,7 +197,7 @@ def is_free(directory: RunDirectory) -> bool:
     if child == 0:
         try:
             other = RunDirectory(directory.path)
-            other.go_on(other.read_config())
+            other.go_on()
         except BaseException:
             os._exit(1)
         os._exit(0)
