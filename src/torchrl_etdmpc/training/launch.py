@@ -112,18 +112,18 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
             directory.go_on()
         stack.callback(directory.close)
         stack.callback(log.close)
-        if plan.action == "resume":
-            run.resume()  # before anything of the run is changed: it may not be possible
-        elif plan.action == "start over":
-            log.start_over()
-        directory.write_config(config.to_dict())
-        directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
         try:
             log.logger = make_logger(config.logger, directory, config.to_dict())
         except BaseException:
             if plan.action == "begin":
                 directory.abandon()
             raise
+        if plan.action == "resume":
+            run.resume()  # before anything of the run is changed: it may not be possible
+        elif plan.action == "start over":
+            log.start_over()
+        directory.write_config(config.to_dict())
+        directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
         summary = run.run()
     return (
         f"{config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
