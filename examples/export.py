@@ -29,12 +29,15 @@ class ExportConfig:
     checkpoint: str
     out: str = "exported"
     batch_size: int = 1
+    task: str | None = None
 
 
 @hydra_main(str(Path(__file__).resolve().parent / "config"), "export", ExportConfig)
 def main(config: ExportConfig) -> None:
     """Exports, compares with the live agent, writes."""
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
+    if config.task not in (None, run.task):
+        raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
     model = agent.world_model
     policy = export_policy(model)
     planner = export_planner(agent.eval_planner, batch_size=config.batch_size)
