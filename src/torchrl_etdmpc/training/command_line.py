@@ -109,7 +109,7 @@ def _without_task_prefix(argument: str) -> str:
 
 
 def _is_setting_of(config_class: type, argument: str) -> bool:
-    """Whether a command has a use for it: one that takes an agent file needs the task's settings for its import only."""
+    """Whether a command has a use for it: one that takes an agent file needs a task's settings only to import it."""
     name = argument.partition("=")[0]
     return name not in _TASK_SETTINGS or name in {field.name for field in dataclasses.fields(config_class)}
 
