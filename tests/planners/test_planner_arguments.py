@@ -60,6 +60,11 @@ def test_an_impossible_argument_is_refused(options, message, make_planner):
         make_planner(LineWorld(), **options)
 
 
+def test_a_plan_from_nothing_is_refused(make_planner):
+    with pytest.raises(ValueError, match=r"^plan needs an observation or a latent, got neither\.$"):
+        make_planner(LineWorld()).plan()
+
+
 @pytest.mark.parametrize("env", [None, LineWorld()])
 def test_an_environment_that_is_not_a_latent_env_is_refused(env):
     with pytest.raises(

@@ -184,12 +184,17 @@ def test_nothing_is_compiled_if_it_is_turned_off(compiled, tiny_agent):
 @pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler")
 def test_a_compiled_agent_plans_like_an_eager_one(tiny_agent):
     eager, fast = tiny_agent(compile="off"), tiny_agent(compile="default")
+    # Reward and value heads begin at zero: all candidates would tie, and which of them are the elites would be chance.
+    for parameter in eager.world_model.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
     fast.world_model.load_state_dict(eager.world_model.state_dict())
     for name, states in (("planner", 1), ("reanalyze_planner", 12)):
         reference, planner = getattr(eager, name), getattr(fast, name)
         observation, noise = torch.randn(states, OBSERVATION_DIM), reference.draw_noise(states)
         assert reference.compiled_plan is None
         expected, actual = (plan(observation, noise=noise) for plan in (reference.plan, planner.compiled_plan))
+        scores = reference.plan(observation, noise=noise, trace=True).trace.scores
+        assert scores.std(-1).min() > 0.01
         for field in ("action", "loc", "scale", "value", "mean"):
             torch.testing.assert_close(getattr(actual, field), getattr(expected, field), rtol=1e-3, atol=1e-4)
         written = planner(TensorDict({"observation": observation, "is_init": torch.ones(states, 1).bool()}, [states]))

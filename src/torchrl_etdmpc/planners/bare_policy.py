@@ -35,8 +35,8 @@ class BarePolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.world_model = world_model
-        self.in_keys = [observation_key]
-        self.out_keys = [action_key]
+        self.in_keys = [observation_key]  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = [action_key]  # pyright: ignore[reportAttributeAccessIssue]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -169,6 +169,8 @@ class Updater:
 
         All of it is one graph when it is compiled, so nothing here may wait for the device or depend on a value.
         """
+        # Departure from BMPC and TD-MPC2, which make two backward passes, the model's and then the policy's: neither
+        # loss sends a gradient into what the other one trains, so the gradient of the sum is both.
         out = self.loss.evaluate(slices, target_values)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
