@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
-import tempfile
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,7 @@ from torchrl_etdmpc.analysis.statistics import (
     normalise,
 )
 from torchrl_etdmpc.analysis.tables import AGGREGATE, result_table, to_csv, to_markdown
+from torchrl_etdmpc.runs.files import replacing
 
 
 def write_report(
@@ -30,7 +32,8 @@ def write_report(
 ) -> Path:
     """Writes ``auc.csv``, ``final.csv``, their Markdown, the figures and ``index.md``.
 
-    Everything is made beside ``out`` first and moved into it at the end, so that an error leaves ``out`` as it was.
+    Every file is written beside its name first and all are moved into place at the end, so that an error leaves the old
+    report as it was.
 
     Args:
         comparison (Comparison): see :func:`compare`.
@@ -44,26 +47,26 @@ def write_report(
     files = _tables(comparison)
     figures = _figures(comparison)
     files["index.md"] = _page(comparison, files, list(figures))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as folder:
-        for name, text in files.items():
-            (Path(folder) / name).write_text(text, encoding="utf-8")
-        for name, figure in figures.items():
-            for ending in filter(None, ("png", vector)):
-                with matplotlib.rc_context({"svg.hashsalt": name}):  # its ids are random otherwise
-                    figure.savefig(Path(folder) / f"{name}.{ending}", dpi=160, metadata=_undated(ending))
-        out.mkdir(exist_ok=True)
-        for file in sorted(Path(folder).iterdir()):
-            os.replace(file, out / file.name)
-        for ending in {"pdf", "svg"} - {vector}:  # of an earlier report, of other data
-            for name in figures:
-                (out / f"{name}.{ending}").unlink(missing_ok=True)
+    contents = {name: text.encode() for name, text in files.items()}
+    for name, figure in figures.items():
+        for ending in filter(None, ("png", vector)):
+            contents[f"{name}.{ending}"] = _picture(figure, name, ending)
+    out.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(replacing(out / name)).write_bytes(content)
+    for ending in {"pdf", "svg"} - {vector}:  # of an earlier report, of other data
+        for name in figures:
+            (out / f"{name}.{ending}").unlink(missing_ok=True)
     return out / "index.md"
 
 
-def _undated(ending: str) -> dict[str, None]:
-    """The same data gives the same file."""
-    return {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(ending, {})
+def _picture(figure: Figure, name: str, ending: str) -> bytes:
+    """The same data gives the same bytes."""
+    memory, undated = io.BytesIO(), {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(ending, {})
+    with matplotlib.rc_context({"svg.hashsalt": name}):  # its ids are random otherwise
+        figure.savefig(memory, format=ending, dpi=160, metadata=undated)
+    return memory.getvalue()
 
 
 def _wide(comparison: Comparison, values: pd.DataFrame, column: str) -> list[pd.DataFrame]:

@@ -108,10 +108,10 @@ class RunDirectory:
         self._lock()
         try:
             self.require_new()  # two processes may have come this far; only one has the lock
-            write_whole(self.config, text)
-        except OSError as error:
+        except FileExistsError:
             self.close()
-            raise error if isinstance(error, FileExistsError) else self._not_writable(error) from error
+            raise
+        self._write_config(text)
 
     def go_on(self, config: Mapping[str, Any]) -> None:
         """Locks the directory of a run that goes on, and stores the configuration if it changed (a longer budget).
@@ -124,7 +124,7 @@ class RunDirectory:
         self._lock()
         text = _to_yaml(config)
         if text != self.config.read_text(encoding="utf-8"):
-            write_whole(self.config, text)
+            self._write_config(text)
 
     def abandon(self) -> None:
         """Forgets a run that never began, so that its directory is free again."""
@@ -136,6 +136,13 @@ class RunDirectory:
         if self._unlock is not None:
             self._unlock()
             self._unlock = None
+
+    def _write_config(self, text: str) -> None:
+        try:
+            write_whole(self.config, text)
+        except OSError as error:
+            self.close()
+            raise self._not_writable(error) from error
 
     def _not_writable(self, error: OSError) -> OSError:
         return OSError(
