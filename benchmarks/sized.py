@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from torchrl_etdmpc import EnsembleMPPIPlanner
-from torchrl_etdmpc.planners import PlanNoise
+from torchrl_etdmpc.planners import Plan, PlanNoise
 from torchrl_etdmpc.training import Agent, TrainConfig, build_agent, preset
 
 OBSERVATION_DIM, ACTION_DIM = 24, 6  # walker
@@ -42,6 +44,11 @@ def make_agent(name: str, variant: str = "eager", **changes) -> tuple[TrainConfi
 def draw(planner: EnsembleMPPIPlanner, states: int) -> tuple[Tensor, PlanNoise]:
     """Observations and the noise of one plan for each."""
     return torch.randn(states, OBSERVATION_DIM, device=DEVICE), planner.draw_noise(states)
+
+
+def plan_of(planner: EnsembleMPPIPlanner) -> Callable[..., Plan]:
+    """What the planner calls when it acts: its compiled plan if it has one."""
+    return planner.compiled_plan or planner.plan
 
 
 def assert_same_plan(plan, expected, variant: str = "eager") -> None:

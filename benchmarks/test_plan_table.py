@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from sized import COMPILED, DEVICE, assert_same_plan, draw, make_agent
+from sized import COMPILED, DEVICE, assert_same_plan, draw, make_agent, plan_of
 
 SIZES = [(heads, horizon, samples) for heads in (1, 2, 4) for horizon in (3, 6) for samples in (128, 512)]
 BATCHES = [1, 16] if DEVICE.type == "cuda" else [1]
@@ -21,7 +21,8 @@ def test_plan_by_size(measure, heads, horizon, samples, states):
     observation, noise = draw(reference.planner, states)
     with torch.no_grad():
         expected = reference.planner.plan(observation, noise=noise)
-        assert_same_plan(agent.planner.plan(observation, noise=noise), expected)
+        plan = plan_of(agent.planner)
+        assert_same_plan(plan(observation, noise=noise), expected)
         flop = measure.flop(lambda: reference.planner.plan(observation))
         case = f"plan of {states}, {heads} heads, horizon {horizon}, {samples} samples"
-        measure(case, COMPILED[-1], lambda: agent.planner.plan(observation), rounds=3, warmup_rounds=1, flop=flop)
+        measure(case, COMPILED[-1], lambda: plan(observation), rounds=3, warmup_rounds=1, flop=flop)
