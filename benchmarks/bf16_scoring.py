@@ -21,6 +21,7 @@ from cpu_learning import RESULTS, SEEDS, TASKS, run
 
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import make_dmc_env
+from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.training import load_agent
 
 FOLDER = RESULTS / "bf16"
@@ -67,7 +68,7 @@ def report() -> str:
     curves = []
     for name, folder in (("float32", RESULTS / TASK), ("bfloat16", FOLDER)):
         for seed in SEEDS:
-            table = pd.read_csv(folder / f"seed{seed}" / "eval.csv")
+            table = pd.read_csv(RunDirectory(folder / f"seed{seed}").eval)
             curves.append(table.assign(scoring=name, seed=seed)[["scoring", "seed", "env_steps", "return_mean"]])
     table = pd.concat(curves).pivot(index=["scoring", "seed"], columns="env_steps", values="return_mean").dropna(axis=1)
     lines = [
@@ -97,7 +98,7 @@ def main() -> None:
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     if not arguments.report_only:
-        keep = ("eval.csv", "summary.json", "checkpoints/last.pt")
+        keep = ("eval", "summary", "last_agent")
 
         def train(seed: int) -> str:
             return run(TASK, seed, TASKS[TASK], *HALF, target=FOLDER / f"seed{seed}", keep=keep)
@@ -105,10 +106,11 @@ def main() -> None:
         with ThreadPoolExecutor(2) as pool:
             for line in pool.map(train, SEEDS):
                 print(line, flush=True)
-        scores = {str(seed): compare(FOLDER / f"seed{seed}" / "last.pt") for seed in SEEDS}
+        agents = {seed: FOLDER / f"seed{seed}" / RunDirectory("").last_agent.name for seed in SEEDS}
+        scores = {str(seed): compare(file) for seed, file in agents.items()}
         (FOLDER / "scores.json").write_text(json.dumps(scores, indent=1) + "\n")
-        for seed in SEEDS:
-            (FOLDER / f"seed{seed}" / "last.pt").unlink()  # megabytes; the numbers are what is kept
+        for file in agents.values():
+            file.unlink()  # megabytes; the numbers are what is kept
     (FOLDER / "README.md").write_text(report())
     print(f"written: {FOLDER / 'README.md'}")
 

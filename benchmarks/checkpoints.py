@@ -13,13 +13,14 @@ import json
 import statistics
 import tempfile
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
 from memory import HUMANOID, MILLION, RESULTS, humanoid_row
 
-from torchrl_etdmpc.training import CheckpointStore, TrainConfig, build_agent, build_replay, preset, row_bytes
+from torchrl_etdmpc.checkpoints import CheckpointStore
+from torchrl_etdmpc.runs import library_versions
+from torchrl_etdmpc.training import AgentFile, TrainConfig, build_agent, build_replay, preset, row_bytes
 
 NEW_ROWS, REFRESHED, SAVES = 25_000, 150_000, 6
 
@@ -44,6 +45,7 @@ def main() -> None:
         patch["plan", "version"] = torch.full((len(index), 1), int(agent.world_model.version))
         buffer.update_if_present(index=index, generation=buffer.writer.generations_of(index), patch=patch)
 
+    parts = {"agent": AgentFile(agent, config, dict)}
     write(MILLION)
     seconds, sizes = [], []
     with tempfile.TemporaryDirectory() as folder:
@@ -53,12 +55,12 @@ def main() -> None:
                 write(NEW_ROWS)
                 refresh(REFRESHED)
             tick = time.perf_counter()
-            store.save(agent, config, {"env_steps": number}, buffer, {})
+            store.save(number, parts, buffer, version=int(agent.world_model.version))
             seconds.append(time.perf_counter() - tick)
             sizes.append(sum(file.stat().st_size for file in (Path(folder) / "replay").iterdir()))
         other = build_replay(config, sizes=HUMANOID)
         tick = time.perf_counter()
-        store.load(agent, other)
+        store.load(parts, other)
         load = time.perf_counter() - tick
         assert (other.storage[:] == buffer.storage[:]).all()
     arithmetic = MILLION * row_bytes(*HUMANOID)
@@ -73,7 +75,7 @@ def main() -> None:
         "arithmetic_mb": arithmetic / 1e6,
         "replay_files_mb": [round(size / 1e6, 1) for size in sizes],
         "largest_over_arithmetic": max(sizes) / arithmetic,
-        "versions": {name: version(name) for name in ("torch", "torchrl", "tensordict")},
+        "versions": library_versions(),
     }
     folder = RESULTS / ("gpu" if torch.cuda.is_available() else "cpu")
     folder.mkdir(parents=True, exist_ok=True)

@@ -9,12 +9,13 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
+
+from torchrl_etdmpc.runs import library_versions
 
 CUDA = torch.cuda.is_available()
 RESULTS = Path(__file__).parent / "results" / ("gpu" if CUDA else "cpu")
@@ -109,8 +110,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     file = RESULTS / "speed.json"
     about = {
         "device": torch.cuda.get_device_name() if CUDA else processor(),
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in ("torch", "torchrl", "tensordict")},
+        "versions": library_versions(),
     }
     done = {(row["case"], row["variant"]) for row in rows}
     old = json.loads(file.read_text()) if file.exists() else []

@@ -24,6 +24,7 @@ from pathlib import Path
 import pandas as pd
 
 from torchrl_etdmpc.analysis import read_runs
+from torchrl_etdmpc.runs import RunDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
@@ -45,11 +46,11 @@ def run(
     env_steps: int,
     *overrides: str,
     target: Path | None = None,
-    keep: Sequence[str] = ("eval.csv", "summary.json"),
+    keep: Sequence[str] = ("eval", "summary"),
 ) -> str:
-    """One run in a process of its own, of which ``keep`` goes to ``target``; returns a line for the terminal."""
+    """One run in a process of its own; files of it (``keep``) go to ``target``. Returns a line for the terminal."""
     target = target or RESULTS / task / f"seed{seed}"
-    if (target / "summary.json").exists():
+    if RunDirectory(target).finished:
         return f"{task} seed {seed}: already there"
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
@@ -60,13 +61,15 @@ def run(
             return f"{task} seed {seed}: failed: {result.stderr.strip().splitlines()[-1]}"
         target.mkdir(parents=True, exist_ok=True)
         for name in keep:
-            shutil.copy(run_dir / name, target / Path(name).name)
+            shutil.copy(getattr(RunDirectory(run_dir), name), target)
     return result.stdout.strip().splitlines()[-1].split(";")[0] + f" (seed {seed})"
 
 
 def folders() -> list[Path]:
     """The tasks with committed runs."""
-    found = [RESULTS / task for task in sorted(TASKS) if any((RESULTS / task).glob("seed*/eval.csv"))]
+    found = [
+        RESULTS / task for task in sorted(TASKS) if any((RESULTS / task).glob(f"seed*/{RunDirectory('').eval.name}"))
+    ]
     if not found:
         sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
     return found
@@ -90,7 +93,7 @@ def write_readme(table: pd.DataFrame) -> None:
         "# Learning runs of the cpu preset",
         "",
         "Made by `python benchmarks/cpu_learning.py`: two runs at a time, one thread each. Return of the evaluation",
-        "(mean of 10 episodes, planner without noise) at the end of the budget; wall time includes seed phase,",
+        "(mean of 10 episodes, planner without noise) at the end of the budget; wall time includes random phase,",
         "compilation and evaluations.",
         "",
         "| task | env steps | seeds | final return: mean (each) | best mean of seeds | wall time, min | decisions/s |",
@@ -98,7 +101,8 @@ def write_readme(table: pd.DataFrame) -> None:
     ]
     versions = set()
     for task, rows in table.groupby("task"):
-        summaries = [json.loads(file.read_text()) for file in sorted((RESULTS / task).glob("seed*/summary.json"))]
+        seeds = sorted((RESULTS / task).glob("seed*"))
+        summaries = [json.loads(RunDirectory(seed).summary.read_text()) for seed in seeds]
         finals = [summary["final_return"] for summary in summaries]
         curve = rows.groupby("env_steps").return_mean.mean()
         walls = sorted(summary["wall_time_s"] / 60 for summary in summaries)

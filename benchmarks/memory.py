@@ -14,15 +14,14 @@ import gc
 import json
 import sys
 import tempfile
-from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
 import torch
 
 from torchrl_etdmpc.envs import make_dmc_env
+from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions
 from torchrl_etdmpc.training import (
-    RunLog,
     TrainConfig,
     TrainingRun,
     build_agent,
@@ -54,18 +53,21 @@ def run_for(decisions: int) -> pd.DataFrame:
     eval_env = make_dmc_env(config.task, seed=1, num_envs=1)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        log = RunLog.create(Path(folder) / "run", config=config.to_dict(), total_env_steps=config.total_env_steps)
+        directory = RunDirectory(Path(folder) / "run")
+        directory.begin(config.to_dict())
+        log = RunLog(directory, total_env_steps=config.total_env_steps)
         run = TrainingRun(config, env=env, eval_env=eval_env, log=log)
-        write_metrics = run.write_metrics
+        write_row, collector = run.write_row, run.learner.collector
 
         def sample() -> None:
-            write_metrics()
-            if run.collector.frames % 1000 == 0:
+            write_row()
+            if collector.frames % 1000 == 0:
                 gc.collect()
-                rows.append({"decisions": run.collector.frames, "resident_mb": round(resident(), 2)})
+                rows.append({"decisions": collector.frames, "resident_mb": round(resident(), 2)})
 
-        run.write_metrics = sample
+        run.write_row = sample
         run.run()
+        directory.close()
     return pd.DataFrame(rows)
 
 
@@ -116,7 +118,7 @@ def main() -> None:
         "resident_mb_at_half": float(half.iloc[0]),
         "resident_mb_at_end": float(half.iloc[-1]),
         "largest_in_second_half": float(half.max()),
-        "versions": {name: version(name) for name in ("torch", "torchrl", "tensordict")},
+        "versions": library_versions(),
     }
     (folder / "memory.json").write_text(json.dumps(answer, indent=1) + "\n")
     print(f"resident memory at half of the run {half.iloc[0]:.0f} MB, at its end {half.iloc[-1]:.0f} MB")

@@ -47,7 +47,7 @@ def draw(planner: EnsembleMPPIPlanner, states: int) -> tuple[Tensor, PlanNoise]:
 
 
 def plan_of(planner: EnsembleMPPIPlanner) -> Callable[..., Plan]:
-    """What the planner calls: the compiled plan where there is one."""
+    """What the planner calls when it acts: its compiled plan if it has one."""
     return planner.compiled_plan or planner.plan
 
 

@@ -21,12 +21,12 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
 from cpu_learning import RESULTS, ROOT
 
+from torchrl_etdmpc.runs import RunDirectory, library_versions
 from torchrl_etdmpc.training import EXIT_CODE
 
 FOLDER = RESULTS / "soak"
@@ -66,8 +66,9 @@ def train(run_dir: Path, task: str, seed: int, minutes: float, pauses: tuple[flo
 def compare(killed: Path, straight: Path) -> dict[str, object]:
     """How many rows both have, and whether they are the same in everything but the clock."""
     answer: dict[str, object] = {}
-    for name in ("eval.csv", "train.csv"):
-        tables = [pd.read_csv(run / name, dtype=str).drop(columns="wall_time_s") for run in (killed, straight)]
+    for table_of in (lambda run: RunDirectory(run).eval, lambda run: RunDirectory(run).train):
+        name = table_of(killed).name
+        tables = [pd.read_csv(table_of(run), dtype=str).drop(columns="wall_time_s") for run in (killed, straight)]
         common = min(map(len, tables))
         answer[f"{name}_rows"] = common
         answer[f"{name}_equal"] = tables[0][:common].equals(tables[1][:common])
@@ -91,10 +92,10 @@ def main() -> None:
         kills = killed.result() + straight.result()
         FOLDER.mkdir(parents=True, exist_ok=True)
         for name, run in runs.items():
-            pd.read_csv(run / "eval.csv", dtype=str).to_csv(FOLDER / f"{name}.csv", index=False)
+            pd.read_csv(RunDirectory(run).eval, dtype=str).to_csv(FOLDER / f"{name}.csv", index=False)
         answer: dict[str, object] = {"task": arguments.task, "seed": arguments.seed, "minutes": arguments.minutes}
         answer |= {"kills": kills} | compare(runs["killed"], runs["straight"])
-    answer["versions"] = {name: version(name) for name in ("torch", "torchrl", "tensordict", "mujoco")}
+    answer["versions"] = library_versions()
     (FOLDER / "soak.json").write_text(json.dumps(answer, indent=1) + "\n")
     print(json.dumps(answer, indent=1))
     if not (answer["eval.csv_equal"] and answer["train.csv_equal"]):

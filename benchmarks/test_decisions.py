@@ -10,7 +10,8 @@ from sized import DEVICE, VARIANTS, configure
 
 from torchrl_etdmpc.collectors import SeedPolicy
 from torchrl_etdmpc.envs import make_dmc_env
-from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, build_agent, build_collector, build_replay
+from torchrl_etdmpc.runs import RunDirectory, RunLog
+from torchrl_etdmpc.training import TrainConfig, TrainingRun, build_agent, build_collector, build_replay
 
 TASK = "walker-walk"
 # What a CPU can do in minutes; a GPU runs them all.
@@ -19,16 +20,17 @@ ON_GPU = [*ON_CPU, "efficient-tdmpc-utd2", "efficient-tdmpc-utd4"]
 
 
 def begin(config: TrainConfig, folder) -> TrainingRun:
-    """A run that has compiled, and has finished its seed phase and pretraining."""
+    """A run that has compiled, and has finished its random phase and pretraining."""
     parallel = DEVICE.type == "cuda"
     env = make_dmc_env(config.task, seed=0, num_envs=config.num_envs, parallel=parallel)
     eval_env = make_dmc_env(config.task, seed=1, num_envs=config.eval_episodes, parallel=False)
-    log = RunLog.create(folder / "run", config=config.to_dict(), total_env_steps=config.total_env_steps)
+    log = RunLog(RunDirectory(folder / "run"), total_env_steps=config.total_env_steps)
     run = TrainingRun(config, env=env, eval_env=eval_env, log=log)
-    run.warm_up()
-    while run.collector.in_seed_phase:
-        run.step()
-    run.pretrain()
+    run.precompile()
+    while run.learner.collector.in_seed_phase:
+        run.learner.step()
+    for _ in run.learner.pretrain():
+        pass
     return run
 
 
@@ -49,18 +51,18 @@ def test_decision(measure, tmp_path, name, num_envs, variant):
         replay={"seed_decisions": 1000, "pretrain_updates": 1 if large else 20},
     )
     run = begin(config, tmp_path)
+    learner = run.learner
     steps = config.reanalyze.every  # of all environments; every decision's share of reanalyze is in
 
     def decide() -> None:
         for _ in range(steps):
-            run.step()
-            run.updates()
+            learner.step(updates=True)
 
-    before = run.agent.updater.updates, run.reanalyze.refreshed
+    before = learner.agent.updater.updates, learner.reanalyze.refreshed
     if not large:
         decide()
-        assert run.agent.updater.updates - before[0] == steps * num_envs * config.optim.updates_per_decision
-        assert run.reanalyze.refreshed > before[1]
+        assert learner.agent.updater.updates - before[0] == steps * num_envs * config.optim.updates_per_decision
+        assert learner.reanalyze.refreshed > before[1]
     environments = "one environment" if num_envs == 1 else f"{num_envs} environments"
     try:
         measure(
@@ -72,15 +74,15 @@ def test_decision(measure, tmp_path, name, num_envs, variant):
             calls=steps * num_envs,
         )
     finally:
-        run.collector.shutdown()
-        run.eval_env.close()
+        learner.collector.shutdown()
+        run.evaluator.close()
 
 
 @pytest.mark.parametrize("variant", ["simulator", "random policy", "environment", "environment and collector"])
 def test_one_step_of_walker(measure, variant):
     """One decision without planner: dm_control alone, the TorchRL environment, and the way into the run's buffer.
 
-    The last holds the random policy of the seed phase, which is measured apart too.
+    The last holds the random policy of the random phase, which is measured apart too.
     """
     config = configure("cpu", "eager", task=TASK, num_envs=1, eval_episodes=1, total_env_steps=100_000)
     env = make_dmc_env(TASK, seed=0)

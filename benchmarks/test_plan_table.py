@@ -21,7 +21,8 @@ def test_plan_by_size(measure, heads, horizon, samples, states):
     observation, noise = draw(reference.planner, states)
     with torch.no_grad():
         expected = reference.planner.plan(observation, noise=noise)
-        assert_same_plan(plan_of(agent.planner)(observation, noise=noise), expected)
+        plan = plan_of(agent.planner)
+        assert_same_plan(plan(observation, noise=noise), expected)
         flop = measure.flop(lambda: reference.planner.plan(observation))
         case = f"plan of {states}, {heads} heads, horizon {horizon}, {samples} samples"
-        measure(case, COMPILED[-1], lambda: plan_of(agent.planner)(observation), rounds=3, warmup_rounds=1, flop=flop)
+        measure(case, COMPILED[-1], lambda: plan(observation), rounds=3, warmup_rounds=1, flop=flop)

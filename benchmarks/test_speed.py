@@ -53,9 +53,10 @@ def test_plan(measure, name, variant):
     observation, noise = draw(reference.planner, 1)
     with torch.no_grad():
         expected = reference.planner.plan(observation, noise=noise)
-        assert_same_plan(plan_of(agent.planner)(observation, noise=noise), expected, variant)
+        plan = plan_of(agent.planner)
+        assert_same_plan(plan(observation, noise=noise), expected, variant)
         flop = measure.flop(lambda: reference.planner.plan(observation))
-        measure(f"plan, {name}", variant, lambda: plan_of(agent.planner)(observation), rounds=ROUNDS[name], flop=flop)
+        measure(f"plan, {name}", variant, lambda: plan(observation), rounds=ROUNDS[name], flop=flop)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -90,10 +91,11 @@ def test_reanalyze(measure, name, variant):
     observation, noise = draw(reference.reanalyze_planner, states)
     with torch.no_grad():
         expected = reference.reanalyze_planner.plan(observation, noise=noise)
-        assert_same_plan(plan_of(agent.reanalyze_planner)(observation, noise=noise), expected, variant)
+        plan = plan_of(agent.reanalyze_planner)
+        assert_same_plan(plan(observation, noise=noise), expected, variant)
         flop = measure.flop(lambda: reference.reanalyze_planner.plan(observation))
-        call, rounds = lambda: plan_of(agent.reanalyze_planner)(observation), max(ROUNDS[name] // 3, 1)
-        measure(f"reanalyze {states} states, {name}", variant, call, rounds=rounds, flop=flop)
+        rounds = max(ROUNDS[name] // 3, 1)
+        measure(f"reanalyze {states} states, {name}", variant, lambda: plan(observation), rounds=rounds, flop=flop)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -116,11 +118,12 @@ def test_bmpc_plan_against_a_straightforward_one(measure, variant):
     observation, noise = draw(reference.planner, 1)
     with torch.no_grad():
         plain = plain_bmpc.plan(reference.planner, observation, noise)
-        assert_same_plan(plan_of(agent.planner)(observation, noise=noise), plain, variant)
+        plan = plan_of(agent.planner)
+        assert_same_plan(plan(observation, noise=noise), plain, variant)
         calls = {
             "eager per head": lambda: plain_bmpc.plan(reference.planner, observation, reference.planner.draw_noise(1))
         }
-        call = calls.get(variant, lambda: plan_of(agent.planner)(observation))
+        call = calls.get(variant, lambda: plan(observation))
         measure("BMPC plan against a plain one", variant, call, rounds=10, baseline="eager per head")
 
 

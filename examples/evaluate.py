@@ -5,6 +5,7 @@ python examples/evaluate.py checkpoint=runs/walker-walk/cpu/seed1/checkpoints/la
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ filming = any(argument.startswith("video=") and argument != "video=null" for arg
 os.environ.setdefault("MUJOCO_GL", "egl" if filming else "disable")
 
 import torch  # noqa: E402
+from tensordict import TensorDictBase  # noqa: E402
 
 from torchrl_etdmpc.collectors import evaluate  # noqa: E402
 from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame  # noqa: E402
@@ -40,6 +42,9 @@ class EvaluateConfig:
     policy: str = "planner"
     video: str | None = None
     task: str | None = None
+    action_repeat: int | None = None
+    episode_length: int | None = None
+    terminates: bool | None = None
     seed: int = 0
     device: str = "auto"
 
@@ -54,10 +59,12 @@ class EvaluateConfig:
 
 def task_of(config: EvaluateConfig) -> Task:
     """The task that the command names, or the one that the agent was trained on, with what its run changed about it."""
+    changes = {name: getattr(config, name) for name in ("action_repeat", "episode_length", "terminates")}
+    told = {name: value for name, value in changes.items() if value is not None}
     stored = read_agent_file(config.checkpoint)["config"]
     if config.task is not None and config.task != stored["task"]:
-        return get_task(config.task)
-    return TrainConfig.from_dict(stored).task_spec
+        return get_task(config.task, **told)
+    return dataclasses.replace(TrainConfig.from_dict(stored).task_spec, **told)
 
 
 @hydra_main(str(Path(__file__).resolve().parent / "config"), "evaluate", EvaluateConfig)
@@ -82,11 +89,13 @@ def main(config: EvaluateConfig) -> None:
         policy = BarePolicy(agent.world_model)
 
     frames: list[torch.Tensor] = []
-    length = task.decision_steps_per_episode
+    ended = False
 
-    def film(_) -> None:
-        if len(frames) < length:
+    def film(step: TensorDictBase) -> None:
+        nonlocal ended
+        if not ended:
             frames.append(render_frame(env))
+            ended = bool(step["next", "done"].any())
 
     if config.video:
         env.reset()

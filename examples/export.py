@@ -30,6 +30,9 @@ class ExportConfig:
     out: str = "exported"
     batch_size: int = 1
     task: str | None = None
+    action_repeat: int | None = None
+    episode_length: int | None = None
+    terminates: bool | None = None
 
 
 @hydra_main(str(Path(__file__).resolve().parent / "config"), "export", ExportConfig)

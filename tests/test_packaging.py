@@ -1,39 +1,63 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 import re
 import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 
+from torchrl_etdmpc.runs import RunDirectory
+
 _ROOT = Path(__file__).parents[1]
 _PACKAGE = _ROOT / "src" / "torchrl_etdmpc"
 
-# What each layer may import from the package, besides itself; a layer that is not named here fails the test.
-_MAY_IMPORT = {
-    "functional": set(),
-    "modules": {"functional"},
-    "envs": {"functional", "modules"},
-    "planners": {"functional", "modules"},
-    "objectives": {"functional", "modules"},
-    "replay": {"functional", "modules"},
-    "collectors": {"functional", "modules", "envs", "replay"},
-    "analysis": {"envs"},  # the names of the tasks
-    "training": {"functional", "modules", "envs", "planners", "objectives", "replay", "collectors", "analysis"},
-    "testing": {"functional", "modules", "envs", "planners", "objectives", "replay", "collectors", "training"},
-}
+# From the ground up: a folder imports from the floors below its own, and of those what stands beside its name.
+_FLOORS = (
+    {
+        "functional": set(),
+        "keys": set(),
+        "envs": set(),
+        "runs": set(),
+    },
+    {
+        "modules": {"functional"},
+        "replay": {"keys"},
+        "collectors": {"keys", "envs", "runs"},
+        "checkpoints": {"keys", "runs"},
+        "analysis": {"envs", "runs"},  # of the environments the names of the tasks
+    },
+    {
+        "planners": {"functional", "keys", "modules"},
+        "objectives": {"functional", "keys", "modules"},
+        "testing": {"functional", "keys", "modules"},
+    },
+    {
+        "training": {
+            *("functional", "keys", "envs", "runs"),
+            *("modules", "replay", "collectors", "checkpoints", "analysis"),
+            *("planners", "objectives"),
+        },
+    },
+)
+_MAY_IMPORT = {name: allowed for floor in _FLOORS for name, allowed in floor.items()}
 _CORE = {"numpy", "tensordict", "torch", "torchrl"}
-_EXTRAS = ("dm_control", "gymnasium", "hydra", "matplotlib", "pandas", "scipy", "tensorboard", "tqdm", "wandb")
+_EXTRAS = (
+    *("dm_control", "gymnasium", "hydra", "imageio_ffmpeg", "matplotlib", "mujoco", "pandas", "scipy", "tensorboard"),
+    *("tqdm", "wandb", "yaml"),
+)
 
 
 def _files(layer: str) -> list[Path]:
-    return sorted((_PACKAGE / layer).rglob("*.py"))
+    file = _PACKAGE / f"{layer}.py"
+    return [file] if file.exists() else sorted((_PACKAGE / layer).rglob("*.py"))
 
 
 def _imports(nodes: Iterator[ast.AST], package: str) -> Iterator[str]:
@@ -54,6 +78,11 @@ def _imports_of(path: Path, *, outside_functions: bool = False) -> set[str]:
     return set(_imports(nodes, package))
 
 
+def _name(path: Path) -> str:
+    """The module's name; that of a package is its folder's."""
+    return ".".join(path.relative_to(_PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+
+
 def _outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
     for node in ast.iter_child_nodes(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -61,14 +90,22 @@ def _outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
             yield from _outside_functions(node)
 
 
-def test_every_folder_of_the_package_has_a_place_in_the_layering():
-    folders = {path.parent.relative_to(_PACKAGE).parts[0] for path in _PACKAGE.rglob("*/*.py")}
-    assert folders <= set(_MAY_IMPORT)
+def test_every_folder_and_file_of_the_package_has_a_place_on_a_floor():
+    found = {path.relative_to(_PACKAGE).parts[0].removesuffix(".py") for path in _PACKAGE.rglob("*.py")}
+    assert found == {"__init__", *_MAY_IMPORT}
+
+
+def test_what_a_folder_may_import_is_on_a_floor_below_its_own():
+    below: set[str] = set()
+    for floor in _FLOORS:
+        for name, allowed in floor.items():
+            assert allowed <= below, name
+        below |= set(floor)
 
 
 @pytest.mark.parametrize("layer", _MAY_IMPORT)
 def test_imports_flow_one_way(layer):
-    allowed = _MAY_IMPORT[layer] | {layer, "keys"}
+    allowed = _MAY_IMPORT[layer] | {layer}
     for path in _files(layer):
         own = {name for name in _imports_of(path) if name.split(".")[0] == "torchrl_etdmpc"}
         # What is not a layer is the package itself, which sits above all layers.
@@ -76,8 +113,69 @@ def test_imports_flow_one_way(layer):
         assert not wrong, f"{path.relative_to(_ROOT)} imports {', '.join(sorted(wrong))}"
 
 
-def test_the_keys_import_nothing():
-    assert _imports_of(_PACKAGE / "keys.py") == {"__future__.annotations"}
+def test_no_file_imports_itself_on_any_way():
+    """Imports for type checkers and inside of functions included."""
+    files = {_name(path): path for path in _PACKAGE.rglob("*.py")}
+    graph = {}
+    for module, path in files.items():
+        names = {name for name in _imports_of(path) if name.split(".")[0] == "torchrl_etdmpc"}
+        graph[module] = {name if name in files else name.rpartition(".")[0] for name in names}
+        assert graph[module] <= set(files)
+    assert sum(map(len, graph.values())) > len(files)
+    try:
+        list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
+
+
+def _strings(path: Path) -> Iterator[str]:
+    """All but docstrings."""
+    tree = ast.parse(path.read_text())
+    prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose:
+            yield node.value
+
+
+def test_the_files_of_a_run_are_named_in_one_place():
+    directory = RunDirectory("")
+    files = (directory.config, directory.train, directory.eval, directory.curve, directory.summary)
+    spelled = {
+        (path.relative_to(_PACKAGE).as_posix(), file.name)
+        for path in _PACKAGE.rglob("*.py")
+        for text in _strings(path)
+        for file in files
+        if file.name in text
+    }
+    assert spelled == {("runs/directory.py", file.name) for file in files}
+
+
+def test_whole_files_are_made_in_one_place():
+    durable = {"fdatasync", "fsync", "link", "rename", "renames", "replace", "symlink"}
+    found: dict[str, set[str]] = {}
+    for path in _PACKAGE.rglob("*.py"):
+        calls = {
+            f"os.{node.attr}"
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+            if node.value.id == "os" and node.attr in durable
+        }
+        calls |= {"tempfile" for name in _imports_of(path) if name.split(".")[0] == "tempfile"}
+        if calls:
+            found[path.relative_to(_PACKAGE).as_posix()] = calls
+    assert found == {
+        "runs/files.py": {"os.fsync", "os.link", "os.replace"},
+        "checkpoints/store.py": {"os.replace"},  # of folders
+    }
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in (_ROOT / "examples").glob("*.py")))
+def test_the_examples_use_public_names_only(script):
+    pytest.importorskip("scipy")  # of analysis
+    for node in ast.walk(ast.parse((_ROOT / "examples" / script).read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "torchrl_etdmpc":
+            public = importlib.import_module(node.module).__all__
+            assert {alias.name for alias in node.names} <= set(public), node.module
 
 
 def test_functional_imports_nothing_but_torch():
@@ -100,10 +198,12 @@ def test_importing_the_package_loads_no_extra():
         "import sys, tensordict, torch, torchrl.collectors, torchrl.data, torchrl.envs, torchrl.modules\n"
         "import torchrl.objectives\n"
         "before = set(sys.modules)\n"
-        "import torchrl_etdmpc, torchrl_etdmpc.envs\n"
+        "import torchrl_etdmpc, torchrl_etdmpc.checkpoints, torchrl_etdmpc.envs, torchrl_etdmpc.runs\n"
+        "import torchrl_etdmpc.testing, torchrl_etdmpc.training\n"
         f"extras = set({_EXTRAS!r})\n"
         "print(*sorted(extras & (set(sys.modules) - before)))\n"
-        "print(*sorted(extras & set(sys.modules) - {'tqdm'}))  # torch loads tqdm itself when it is there\n"
+        "loaded_by_torch = {'mujoco', 'tqdm'}  # and TorchRL, where they are there\n"
+        "print(*sorted(extras & set(sys.modules) - loaded_by_torch))\n"
     )
     environment = os.environ | {"PYTHONPATH": str(_ROOT / "src"), "MUJOCO_GL": "disable"}
     run = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)

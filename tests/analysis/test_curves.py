@@ -16,7 +16,7 @@ import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
 from torchrl_etdmpc.analysis import estimate, find_runs, read_curves, read_run, read_runs  # noqa: E402
-from torchrl_etdmpc.training import RunLog  # noqa: E402
+from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
 
 REFERENCE = Path(__file__).resolve().parents[2] / "benchmarks" / "reference"
 HEADER = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes\n"
@@ -65,10 +65,12 @@ def test_of_rows_with_the_same_steps_the_last_counts_and_steps_increase(tmp_path
 
 def test_what_the_run_log_writes_is_read_back(tmp_path):
     config = {"task": "walker-run", "preset": "utd4", "seed": 7}
-    log = RunLog.create(tmp_path / "run", config=config, total_env_steps=4000)
+    directory = RunDirectory(tmp_path / "run")
+    directory.begin(config)
+    log = RunLog(directory, total_env_steps=4000)
     for steps, value in ((0, 1.5), (4000, 20.25)):
         counters = {"env_steps": steps, "decision_steps": steps // 2, "updates": 3, "wall_time_s": 1.0}
-        log.log_eval(return_mean=value, return_std=0.0, episodes=1, **counters)
+        log.log_eval({"return_mean": value, "return_std": 0.0, "episodes": 1}, **counters)
     expected = {
         "method": "utd4",
         "task": "walker-run",

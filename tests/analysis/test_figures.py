@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import math
+import struct
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("matplotlib")
@@ -10,7 +14,8 @@ import pandas as pd  # noqa: E402
 from matplotlib.colors import to_hex  # noqa: E402
 from matplotlib.container import BarContainer, ErrorbarContainer  # noqa: E402
 
-from torchrl_etdmpc.analysis import method_styles, plot_aggregate, plot_auc, plot_curves  # noqa: E402
+from torchrl_etdmpc.analysis import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run  # noqa: E402
+from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
 
 METHODS = ("mine", "other", "BMPC", "SAC")
 TASKS = ("walker-walk", "cup-catch", "walker-run")
@@ -171,3 +176,48 @@ def test_an_unavailable_area_has_the_word_and_no_bar(table):
     assert [(text.get_text().strip(), text.get_position()[0]) for text in axis.texts] == [("unavailable", 0)]
     (bar,) = axis.patches
     assert bar.get_x() < 1 < bar.get_x() + bar.get_width()
+
+
+@pytest.fixture
+def run_log(tmp_path: Path) -> RunLog:
+    directory = RunDirectory(tmp_path)
+    directory.begin({"task": "walker-walk", "preset": "cpu", "seed": 1})
+    return RunLog(directory, total_env_steps=4000)
+
+
+def evaluate(log: RunLog, *means: float, std: float = 2.0) -> None:
+    for step, mean in enumerate(means):
+        results = {"return_mean": mean, "return_std": std, "episodes": 10}
+        log.log_eval(results, env_steps=1000 * step, decision_steps=500 * step, updates=step, wall_time_s=9.5)
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    header = path.read_bytes()[:24]
+    assert header[:8] == b"\x89PNG\r\n\x1a\n"
+    return struct.unpack(">II", header[16:24])
+
+
+def test_the_picture_of_a_run_is_of_sensible_size_even_with_a_nan_return(tmp_path, run_log):
+    evaluate(run_log, 10.0, math.nan, 300.0, 700.0)
+    path = plot_run(tmp_path)
+    assert path == run_log.directory.curve
+    assert png_size(path) == (960, 600)
+    assert path.stat().st_size > 10_000
+    assert sorted(file.name for file in tmp_path.iterdir()) == [".lock", "config.yaml", "curve.png", "eval.csv"]
+
+
+def test_a_single_evaluation_without_a_spread_is_drawn_too(tmp_path, run_log):
+    evaluate(run_log, -31.0, std=math.nan)
+    assert png_size(plot_run(tmp_path)) == (960, 600)
+
+
+def test_the_picture_of_a_run_needs_a_finite_return(tmp_path, run_log):
+    evaluate(run_log, math.nan)
+    with pytest.raises(ValueError, match=r"needs an evaluation with a finite return, got none; evaluate first\.$"):
+        plot_run(tmp_path)
+    assert not run_log.directory.curve.exists()
+
+
+def test_the_picture_of_a_run_needs_the_directory_of_a_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"has neither config\.yaml nor summary\.json, which name its task and"):
+        plot_run(tmp_path)

@@ -136,14 +136,29 @@ def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_
     def save(figure, file, **options):
         calls.append(file)
         if len(calls) == which:
-            raise OSError("disk full")
+            raise RuntimeError("no figure today")
         file.write(b"picture")
 
     monkeypatch.setattr(Figure, "savefig", save)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(RuntimeError, match="no figure today"):
         write_report(comparison(), out)
     assert contents(out) == dict.fromkeys(FILES, b"old")
     assert [path.name for path in tmp_path.iterdir()] == ["report"]
+
+
+def test_a_full_disk_leaves_the_old_report_as_it_was_and_nothing_beside_it(monkeypatch, small_disk, leave_free):
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(bytes(40_000)))
+    out = small_disk / "report"
+    write_report(comparison(), out)
+    old = contents(out)
+    for free in (0, 20_000, 60_000, 100_000):
+        leave_free(small_disk, free)
+        with pytest.raises(OSError, match="No space left on device"):
+            write_report(comparison(height=3.0), out)
+        assert contents(out) == old
+    leave_free(small_disk, None)
+    write_report(comparison(height=3.0), out)
+    assert set(contents(out)) == FILES and contents(out) != old
 
 
 def test_a_figure_that_fails_makes_no_report(monkeypatch, tmp_path):
@@ -159,7 +174,7 @@ def test_a_figure_that_fails_makes_no_report(monkeypatch, tmp_path):
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page and the tables only, which is much faster."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b""))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b"picture"))
 
 
 def test_one_seed_is_a_mean_whose_missing_interval_the_page_explains(without_figures, tmp_path):

@@ -13,34 +13,38 @@ import torch
 pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
+from torchrl_etdmpc.envs import make_dmc_env, make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     BarePolicy,
     TrainConfig,
     build_agent,
     evaluate,
     load_agent,
-    save_checkpoint,
+    save_agent,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "evaluate.py"
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def save_untrained(folder: Path, observation_dim: int, **settings: object) -> Path:
     """An untrained agent of small networks, as if 400 env steps had been made."""
     config = TrainConfig.from_dict(
         {
-            "task": "cartpole-balance",
             "compile": "off",
             "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
             "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+            **settings,
         }
     )
     torch.manual_seed(0)
-    agent = build_agent(config, observation_dim=5, action_dim=1)
-    return save_checkpoint(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 400})
+    agent = build_agent(config, observation_dim=observation_dim, action_dim=1)
+    return save_agent(folder / "last.pt", agent, config, {"env_steps": 400})
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_untrained(tmp_path_factory.mktemp("run"), 5, task="cartpole-balance")
 
 
 @pytest.fixture
@@ -106,6 +110,56 @@ def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_m
     )
     assert (message, err) == (None, "")
     assert out.startswith("cartpole-swingup (bare, trained for 400 env steps): return ")
+
+
+def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, run_main):
+    pytest.importorskip("gymnasium")
+    task = {"task": "gym/Pendulum-v1", "action_repeat": 2, "episode_length": 40}
+    checkpoint = save_untrained(tmp_path, 3, **task)
+    message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=2", "seed=5", "device=cpu")
+    assert (message, err) == (None, "")
+    agent, config, _ = load_agent(checkpoint)
+    assert config.task_spec.decision_steps_per_episode == 20
+    env = make_env(config.task_spec, seed=5, num_envs=2, parallel=False)
+    env = env.append_transform(agent.eval_planner.make_tensordict_primer())
+    torch.manual_seed(5)
+    line = closing_line(evaluate(env, agent.eval_planner, episodes=2), "planner")
+    assert out == line.replace("cartpole-balance", "gym/Pendulum-v1") + "\n"
+
+
+def test_the_command_may_change_the_protocol(tmp_path, run_main):
+    pytest.importorskip("gymnasium")
+    checkpoint = save_untrained(tmp_path, 3, task="gym/Pendulum-v1", action_repeat=2, episode_length=40)
+    common = (f"checkpoint={checkpoint}", "episodes=1", "policy=bare", "device=cpu", "task.action_repeat=4")
+    returns = []
+    for arguments in (["task.episode_length=8"], ["task=gym/Pendulum-v1", "task.episode_length=4"]):
+        message, out, err = run_main(*common, *arguments)
+        assert (message, err) == (None, "")
+        returns.append(float(out.split("return ")[1].split()[0]))
+    assert returns[0] < returns[1] < 0  # two decisions from the same state cost more than the first alone
+
+
+def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main):
+    """Even if it terminates early and others follow."""
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("mujoco")
+    checkpoint = save_untrained(tmp_path, 4, task="gym/InvertedPendulum-v5")
+    pictures, films = [], []
+
+    def render_frame(env):
+        pictures.append(torch.zeros(2, 2, 3, dtype=torch.uint8))
+        return pictures[-1]
+
+    monkeypatch.setattr("torchrl_etdmpc.envs.render_frame", render_frame)
+    monkeypatch.setattr("torchrl_etdmpc.runs.write_mp4", lambda frames, path, fps: films.append(len(frames)))
+    message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "device=cpu", "video=a.mp4")
+    assert (message, err) == (None, "")
+    agent, config, _ = load_agent(checkpoint)
+    first = evaluate(make_env(config.task_spec, seed=0), BarePolicy(agent.world_model), episodes=1)
+    assert first.item() < 200  # every decision upright is worth 1
+    env = make_env(config.task_spec, seed=0)
+    env.reset()  # as the script does, to see whether this machine can render
+    assert films == [len(env.rollout(1000, BarePolicy(agent.world_model)))]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, preset, save_checkpoint  # noqa: E402
+from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, preset, save_agent  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT = ("torchrl", "tensordict", "torchrl_etdmpc", "dm_control", "hydra")
@@ -30,14 +31,14 @@ def make_agent():
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory) -> Path:
     agent, config = make_agent()
-    return save_checkpoint(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 0})
+    return save_agent(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 0})
 
 
 def test_the_files_run_in_a_process_that_has_pytorch_only(checkpoint, tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(ROOT / "examples" / "export.py"), f"checkpoint={checkpoint}", "out=exported"]
     process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert process.returncode == 0, process.stderr
+    assert (process.returncode, process.stderr) == (0, "")
     assert process.stdout == (
         "walker-walk: exported/policy.pt2 and exported/planner.pt2, observations [1, 24], actions [1, 6], "
         "plan_mean [1, 3, 6]\n"
@@ -62,6 +63,26 @@ print(torch.export.load("exported/planner.pt2").module()(observation, plan_mean)
     torch.manual_seed(0)
     plan = agent.eval_planner.plan(observation, torch.zeros(1, 3, 6), explore=False)
     torch.testing.assert_close(planned, plan.action)
+
+
+def test_an_agent_of_a_gymnasium_task_is_exported(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("gymnasium")
+    values = preset("cpu").to_dict() | {"compile": "off", "task": "gym/InvertedPendulum-v5"}
+    config = TrainConfig.from_dict(values)
+    agent = build_agent(config, 4, 1)
+    assert agent.world_model.termination_head is not None
+    save_agent(tmp_path / "last.pt", agent, config, {"env_steps": 0})
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
+    monkeypatch.setattr(sys, "argv", ["export.py", "checkpoint=last.pt", "out=exported"])
+    runpy.run_path(str(ROOT / "examples" / "export.py"), run_name="__main__")
+    assert capsys.readouterr().out.startswith("gym/InvertedPendulum-v5: exported/policy.pt2 and exported/planner.pt2")
+    policy = torch.export.load(tmp_path / "exported" / "policy.pt2").module()
+    observation = torch.randn(1, 4)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            policy(observation), agent.world_model.policy(agent.world_model.encode(observation))[0]
+        )
 
 
 def test_a_missing_checkpoint_is_one_line(tmp_path):

@@ -22,15 +22,14 @@ pytest.importorskip("hydra")
 
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer  # noqa: E402
 
-from torchrl_etdmpc.replay import ReplayJournal  # noqa: E402
+from torchrl_etdmpc.checkpoints import ReplayJournal  # noqa: E402
 from torchrl_etdmpc.training import EXIT_CODE  # noqa: E402
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
 ROOT = Path(__file__).resolve().parents[2]
-SCRIPT = ROOT / "examples" / "train_dmc.py"
 COMMAND = (
-    "task=cartpole-balance preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=400 log_every=40 "
+    "preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=400 log_every=40 "
     "eval_every=150 eval_episodes=1 checkpoint_every=30 model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 "
     "planner.horizon=2 planner.num_samples=8 planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 "
     "reanalyze.num_samples=6 reanalyze.num_elites=3 reanalyze.iterations=1 optim.batch_size=4 "
@@ -38,11 +37,12 @@ COMMAND = (
 ).split()
 
 
-def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
+def start(cwd: Path, *arguments: str, task: str = "cartpole-balance") -> subprocess.Popen[str]:
+    script = ROOT / "examples" / ("train.py" if task.startswith("gym/") else "train_dmc.py")
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
     environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
-        [sys.executable, str(SCRIPT), *COMMAND, *arguments],
+        [sys.executable, str(script), f"task={task}", *COMMAND, *arguments],
         cwd=cwd,
         env=environment,
         stdout=subprocess.PIPE,
@@ -94,24 +94,38 @@ def straight(tmp_path_factory) -> dict[str, object]:
     return results(directory / "run")
 
 
-def kill_and_go_on(directory: Path, kills: int, seed: int, *arguments: str) -> None:
+def kill_and_go_on(directory: Path, kills: int, seed: int, *arguments: str, **task: str) -> None:
     """Kills the process at random moments, mostly between checkpoints and sometimes while one is written."""
     moments = random.Random(seed)
     run_dir = directory / "run"
     for _ in range(kills):
-        process = start(directory, "run_dir=run", "resume=auto", *arguments)
+        process = start(directory, "run_dir=run", "resume=auto", *arguments, **task)
         before = checkpoints(run_dir)
         with contextlib.suppress(AssertionError):  # it may finish before it is killed
             wait_for(lambda known=before: checkpoints(run_dir) != known, process)
         time.sleep(moments.uniform(0, 0.3))
         process.kill()
         process.communicate()
-    finish(start(directory, "run_dir=run", "resume=auto", *arguments))
+    finish(start(directory, "run_dir=run", "resume=auto", *arguments, **task))
 
 
 def test_a_run_that_is_killed_three_times_ends_as_if_it_had_not_been(tmp_path, straight):
     kill_and_go_on(tmp_path, kills=3, seed=0)
     assert results(tmp_path / "run") == straight
+
+
+def test_a_run_on_a_task_that_terminates_is_exact_too(tmp_path):
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("mujoco")
+    (tmp_path / "straight").mkdir()
+    (tmp_path / "killed").mkdir()
+    task = "gym/InvertedPendulum-v5"
+    finish(start(tmp_path / "straight", "run_dir=run", task=task))
+    kill_and_go_on(tmp_path / "killed", 2, 0, task=task)
+    straight = results(tmp_path / "straight" / "run")
+    assert results(tmp_path / "killed" / "run") == straight
+    assert sum(flag for (flag,) in straight["replay"]["('next', 'terminated')"]) > 10  # the head had something to learn
+    assert any("termination_head" in name for name in straight["weights"])
 
 
 def test_a_run_that_is_killed_before_its_first_checkpoint_starts_over(tmp_path, straight):

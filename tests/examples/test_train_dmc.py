@@ -18,7 +18,7 @@ import torch
 pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.training import PRESETS, TrainConfig, preset, read_checkpoint  # noqa: E402
+from torchrl_etdmpc.training import PRESETS, TrainConfig, preset, read_agent_file  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "train_dmc.py"
@@ -30,6 +30,8 @@ SMALL_RUN = (
     "planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 reanalyze.num_samples=6 reanalyze.num_elites=3 "
     "reanalyze.iterations=1 optim.batch_size=4 replay.seed_decisions=40 replay.pretrain_updates=4"
 ).split()
+
+PARTS = ("agent", "collector", "sampler", "reanalyze", "learner", "log", "state", "random")
 
 
 def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -88,7 +90,8 @@ def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(fini
         "curve.png",
         "checkpoints/last.pt",
         "checkpoints/best.pt",
-        *(f"checkpoints/resume/000000000120/{name}" for name in ("agent.pt", "run.pt", "manifest.json")),
+        *(f"checkpoints/resume/000000000120/{name}.pt" for name in PARTS),
+        "checkpoints/resume/000000000120/manifest.json",
     }
     files = set(file_hashes(directory))
     replay = {name for name in files if name.startswith("runs/first/checkpoints/replay/")}
@@ -118,7 +121,7 @@ def test_the_files_of_a_run_agree_on_what_was_done(finished):
     assert 0 < summary["final_return"] <= 1000
     with (run_dir / "train.csv").open(newline="") as file:
         assert [row["env_steps"] for row in csv.DictReader(file)] == ["100", "120"]
-    content = read_checkpoint(run_dir / "checkpoints" / "last.pt")
+    content = read_agent_file(run_dir / "checkpoints" / "last.pt")
     assert content["counters"]["env_steps"] == summary["env_steps"] == 120
     assert content["counters"]["updates"] == 4 + 20
     assert content["config"]["seed"] == 3
@@ -175,39 +178,54 @@ def test_a_missing_package_is_named_in_one_line(tmp_path, package, message):
 
 
 REFUSED = [
-    (["task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
-    (["task=null"], "task must be of type str, got None."),
-    (["preset=fast"], f"unknown preset 'fast'; choose one of {', '.join(PRESETS)}."),
-    (["planner.horizn=3"], "Could not override 'planner.horizn'. "),
-    (["+planner.horizn=3"], "unknown setting planner.horizn; known: horizon, "),
-    (["planner.horizon"], "Error parsing override 'planner.horizon' missing EQUAL"),
-    (["planner.horizon=three"], "planner.horizon must be of type int, got 'three'."),
-    (["planner.horizon=0"], "planner.horizon must be at least 1, got 0."),
-    (["planner.num_elites=600"], "planner.num_elites must be at most planner.num_samples=512, got 600."),
-    (["planner.first_action=worst"], "planner.first_action must be one of elite, mean, best, got 'worst'."),
-    (["planner.std_min=-1"], "planner.std_min must be in (0, planner.std_max=2.0], got -1.0."),
-    (["model.latent_dim=20"], "model.latent_dim must be a multiple of model.simnorm_dim=8, got 20."),
-    (["model.activation=tanh"], "model.activation must be one of mish, silu, relu, got 'tanh'."),
-    (["total_env_steps=5000"], "total_env_steps must exceed the seed phase of 5000 env steps, got 5000; raise "),
-    (["replay.capacity=2"], "replay.capacity must be at least 6 with these settings, got 2."),
-    (["num_envs=0"], "num_envs must be at least 1, got 0."),
-    (["resume=true"], "run_dir=runs/walker-walk/efficient-tdmpc/seed1 holds no run to go on with; start it with "),
-    (["logger=wandb"], "logger=wandb needs wandb, which is not installed; run `pip install torchrl_etdmpc[wandb]`."),
-    (["device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."),
-    (["device=cuda:first"], "Invalid device string: 'cuda:first'"),
-    (["run_dir=taken/run"], "run_dir=taken/run cannot be written (Not a directory); choose a directory that you can "),
+    ("task=walker-wlak", "unknown task 'walker-wlak'; did you mean walker-walk, "),
+    ("task=null", "task must be of type str, got None."),
+    ("task=gym/Pendulum-v1", "train_dmc.py knows the 28 DMC tasks, not 'gym/Pendulum-v1'; use examples/train.py."),
+    ("task=nowhere:make", "task 'nowhere:make': there is no module 'nowhere' on Python's path or in "),
+    ("task.action_repeat=x", "task.action_repeat must be a whole number, got 'x'."),
+    ("task.action_repeat=0", "action_repeat of task 'walker-walk' must be at least 1, got 0."),
+    ("task.terminates=maybe", "task.terminates must be true or false, got 'maybe'."),
+    ("preset=fast", f"unknown preset 'fast'; choose one of {', '.join(PRESETS)}."),
+    ("planner.horizn=3", "Could not override 'planner.horizn'. "),
+    ("+planner.horizn=3", "unknown setting planner.horizn; known: horizon, "),
+    ("planner.horizon", "Error parsing override 'planner.horizon' missing EQUAL"),
+    ("planner.horizon=three", "planner.horizon must be of type int, got 'three'."),
+    ("planner.horizon=0", "planner.horizon must be at least 1, got 0."),
+    ("planner.num_elites=600", "planner.num_elites must be at most num_samples=512, got 600."),
+    ("planner.num_proposals=600", "planner.num_proposals must be in [0, num_samples=512), got 600."),
+    ("planner.first_action=worst", "planner.first_action must be one of elite, mean, best, got 'worst'."),
+    ("planner.score=median", "planner.score must be one of final, mean, adaptive, got 'median'."),
+    ("planner.std_min=-1", "planner.std_min must be in (0, std_max=2.0], got -1.0."),
+    ("planner.scoring_dtype=int8", "planner.scoring_dtype must be one of float16, bfloat16, float32, float64, got "),
+    ("reanalyze.num_elites=100", "reanalyze.num_elites must be at most num_samples=64, got 100."),
+    ("reanalyze.num_slices=0", "reanalyze.num_slices must be at least 1, got 0."),
+    ("model.latent_dim=20", "model.latent_dim must be a multiple of simnorm_dim=8, got 20; the nearest is 16."),
+    ("model.dropout=1", "model.dropout must be in [0, 1), got 1.0."),
+    ("model.activation=tanh", "model.activation must be one of mish, silu, relu, got 'tanh'."),
+    ("loss.rho=2", "loss.rho must be in (0, 1], got 2.0."),
+    ("loss.slice_len=0", "loss.slice_len must be at least 1, got 0."),
+    ("loss.slice_len=1000", "loss.slice_len must fit into an episode of 500 decisions, got 1000."),
+    ("optim.lr=0", "optim.lr must be positive, got 0.0."),
+    ("total_env_steps=5000", "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise "),
+    ("replay.capacity=2", "replay.capacity must be at least 6 with these settings, got 2."),
+    ("num_envs=0", "num_envs must be at least 1, got 0."),
+    ("resume=true", "run_dir=runs/walker-walk/efficient-tdmpc/seed1 holds no run to go on with; start it with "),
+    ("logger=wandb", "logger=wandb needs wandb, which is not installed; run `pip install torchrl_etdmpc[wandb]`."),
+    ("device=cuda", "device=cuda needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."),
+    ("device=cuda:first", "Invalid device string: 'cuda:first'"),
+    ("run_dir=taken/run", "run_dir=taken/run cannot be written (Not a directory); choose a directory that you can "),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
-def test_a_bad_input_ends_in_one_line_and_leaves_nothing_behind(tmp_path, monkeypatch, run_main, arguments, message):
+@pytest.mark.parametrize(("argument", "message"), REFUSED, ids=[argument for argument, _ in REFUSED])
+def test_a_bad_input_ends_in_one_line_and_leaves_nothing_behind(tmp_path, monkeypatch, run_main, argument, message):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find_spec(name))
-    if arguments == ["run_dir=taken/run"]:
+    if argument == "run_dir=taken/run":
         (tmp_path / "taken").write_text("a file, not a folder")
     before = file_hashes(tmp_path)
-    err = run_main(*arguments)
+    err = run_main(argument)
     assert err.startswith(f"error: {message}")
     assert err.count("\n") == 1
     assert file_hashes(tmp_path) == before

@@ -10,7 +10,7 @@ import torch
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
-from torchrl_etdmpc.training.video import write_mp4  # noqa: E402
+from torchrl_etdmpc.runs import write_mp4  # noqa: E402
 
 # imageio-ffmpeg leaves its pipes to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

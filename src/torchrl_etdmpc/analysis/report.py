@@ -32,8 +32,8 @@ def write_report(
 ) -> Path:
     """Writes ``auc.csv``, ``final.csv``, their Markdown, the figures and ``index.md``.
 
-    Everything is made and written beside the old files before the first one is replaced, so that an error leaves
-    ``out`` as it was.
+    Every file is written beside its name first and all are moved into place at the end, so that an error leaves the old
+    report as it was.
 
     Args:
         comparison (Comparison): see :func:`compare`.
@@ -44,15 +44,16 @@ def write_report(
         Path: of ``index.md``.
     """
     out = Path(out)
-    tables, figures = _tables(comparison), _figures(comparison)
-    texts = tables | {"index.md": _page(comparison, tables, list(figures))}
-    files = {name: text.encode() for name, text in texts.items()}
+    files = _tables(comparison)
+    figures = _figures(comparison)
+    files["index.md"] = _page(comparison, files, list(figures))
+    contents = {name: text.encode() for name, text in files.items()}
     for name, figure in figures.items():
         for ending in filter(None, ("png", vector)):
-            files[f"{name}.{ending}"] = _picture(figure, name, ending)
+            contents[f"{name}.{ending}"] = _picture(figure, name, ending)
     out.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as stack:  # moves them into place when all are written
-        for name, content in files.items():
+    with contextlib.ExitStack() as stack:
+        for name, content in contents.items():
             stack.enter_context(replacing(out / name)).write_bytes(content)
     for ending in {"pdf", "svg"} - {vector}:  # of an earlier report, of other data
         for name in figures:
@@ -61,15 +62,11 @@ def write_report(
 
 
 def _picture(figure: Figure, name: str, ending: str) -> bytes:
-    memory = io.BytesIO()
+    """The same data gives the same bytes."""
+    memory, undated = io.BytesIO(), {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(ending, {})
     with matplotlib.rc_context({"svg.hashsalt": name}):  # its ids are random otherwise
-        figure.savefig(memory, format=ending, dpi=160, metadata=_undated(ending))
+        figure.savefig(memory, format=ending, dpi=160, metadata=undated)
     return memory.getvalue()
-
-
-def _undated(ending: str) -> dict[str, None]:
-    """The same data gives the same file."""
-    return {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(ending, {})
 
 
 def _wide(comparison: Comparison, values: pd.DataFrame, column: str) -> list[pd.DataFrame]:

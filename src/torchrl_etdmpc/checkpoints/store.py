@@ -2,13 +2,14 @@
 
 ==========================  ================================================================================
 ``resume/<step>/``          one file for each part, and ``manifest.json``, which names every file with its
-                            checksum
+                            checksum, and has one itself
 ``replay/``                 the buffer, see :class:`~torchrl_etdmpc.checkpoints.ReplayJournal`
 ==========================  ================================================================================
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -86,7 +87,8 @@ class CheckpointStore:
         """Writes a checkpoint; what was saved before stays usable until the new one is in place.
 
         Args:
-            step (int): names the checkpoint; the highest is the newest.
+            step (int): names the checkpoint; the highest is the newest. Those of higher steps go: a run that went on
+                from an older one has lost them.
             parts (mapping): name to owner of a state; a name is a file name.
             buffer (TensorDictReplayBuffer): the same one at every call.
 
@@ -110,7 +112,8 @@ class CheckpointStore:
             files = {
                 name: write_tensors(partial / f"{name}.pt", dict(part.state_dict())) for name, part in parts.items()
             }
-            write_whole(partial / "manifest.json", json.dumps({"format": FORMAT, "files": files, "replay": replay}))
+            manifest = {"format": FORMAT, "files": files, "replay": replay}
+            write_whole(partial / "manifest.json", json.dumps(manifest | {"sha256": _checksum(manifest)}))
             for path, name in (links or {}).items():  # before the checkpoint: its parts may say that this was done
                 link(partial / f"{name}.pt", path)
             if target.exists():  # the same step again, e.g. in pretraining
@@ -122,6 +125,9 @@ class CheckpointStore:
             shutil.rmtree(partial, ignore_errors=True)
             self._prune()
             raise
+        for folder in self._folders():
+            if folder.name > target.name:
+                shutil.rmtree(folder, ignore_errors=True)
         self._prune()
         return target
 
@@ -190,4 +196,10 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{folder}/manifest.json is missing or damaged") from error
     if number != FORMAT:
         raise CheckpointError(f"{folder} has checkpoint format {number}; this version resumes from {FORMAT}")
+    if manifest.pop("sha256", None) != _checksum(manifest):
+        raise CheckpointError(f"{folder}/manifest.json is missing or damaged")
     return manifest
+
+
+def _checksum(manifest: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()

@@ -108,10 +108,10 @@ class RunDirectory:
         self._lock()
         try:
             self.require_new()  # two processes may have come this far; only one has the lock
-            write_whole(self.config, text)
-        except OSError as error:
+        except FileExistsError:
             self.close()
-            raise error if isinstance(error, FileExistsError) else self._not_writable(error) from error
+            raise
+        self._write_config(text)
 
     def go_on(self) -> None:
         """Locks the directory of a run that goes on.
@@ -128,11 +128,11 @@ class RunDirectory:
 
         Raises:
             ValueError: if YAML cannot hold it.
-            OSError: if it cannot be written.
+            OSError: if it cannot be written; the directory is closed.
         """
         text = _to_yaml(config)
         if not self.config.is_file() or text != self.config.read_text(encoding="utf-8"):
-            write_whole(self.config, text)
+            self._write_config(text)
 
     def abandon(self) -> None:
         """Forgets a run that never began, so that its directory is free again."""
@@ -144,6 +144,13 @@ class RunDirectory:
         if self._unlock is not None:
             self._unlock()
             self._unlock = None
+
+    def _write_config(self, text: str) -> None:
+        try:
+            write_whole(self.config, text)
+        except OSError as error:
+            self.close()
+            raise self._not_writable(error) from error
 
     def _not_writable(self, error: OSError) -> OSError:
         return OSError(

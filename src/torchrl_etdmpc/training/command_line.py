@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
 import sys
@@ -66,9 +65,8 @@ def hydra_main(
                 from omegaconf import OmegaConf
             except ImportError as error:
                 raise ImportError("the examples need hydra-core; run: pip install torchrl_etdmpc[train]") from error
-            arguments = [_without_task_prefix(argument) for argument in sys.argv[1:]]
-            _import_tasks(arguments)
-            sys.argv[1:] = [argument for argument in arguments if _is_setting_of(config_class, argument)]
+            sys.argv[1:] = [_without_task_prefix(argument) for argument in sys.argv[1:]]
+            _import_tasks(sys.argv[1:])
             os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us instead of being printed over many lines
             for name, values in PRESETS.items():
                 ConfigStore.instance().store(group="preset", name=name, node=values.to_dict(), package="_global_")
@@ -106,12 +104,6 @@ def _without_task_prefix(argument: str) -> str:
     name, equals, value = argument.partition("=")
     group, _, setting = name.partition(".")
     return f"{setting}{equals}{value}" if group == "task" and setting in _TASK_SETTINGS else argument
-
-
-def _is_setting_of(config_class: type, argument: str) -> bool:
-    """Whether a command has a use for it: one that takes an agent file needs a task's settings only to import it."""
-    name = argument.partition("=")[0]
-    return name not in _TASK_SETTINGS or name in {field.name for field in dataclasses.fields(config_class)}
 
 
 def _import_tasks(arguments: list[str]) -> None:

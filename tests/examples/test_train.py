@@ -1,0 +1,207 @@
+"""Any task: Gymnasium's by its id, or one in a file of the user's own, whose code runs only if the command names it."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("gymnasium")
+pytest.importorskip("hydra")
+
+from torchrl_etdmpc.training import read_agent_file  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL_RUN = (
+    "preset=cpu seed=3 device=cpu compile=off total_env_steps=140 log_every=20 eval_every=100000 eval_episodes=2 "
+    "model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 planner.horizon=2 planner.num_samples=8 "
+    "planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 reanalyze.num_samples=6 reanalyze.num_elites=3 "
+    "reanalyze.iterations=1 optim.batch_size=4 replay.seed_decisions=40 replay.pretrain_updates=4"
+).split()
+
+# An environment without a time limit; its module leaves a mark whenever it is imported.
+MODULE = """
+from pathlib import Path
+
+import gymnasium
+from torchrl.envs import ActionScaling, GymEnv, GymWrapper, TransformedEnv
+
+with Path(__file__).with_name("imported").open("a") as file:
+    file.write("x")
+
+
+def make_my_env():
+    return TransformedEnv(GymWrapper(gymnasium.make("Pendulum-v1").unwrapped), ActionScaling())
+
+
+def make_limited():
+    return TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
+
+
+def make_unscaled():
+    return GymEnv("Pendulum-v1")
+
+
+def make_nothing():
+    return 3
+
+
+def fail():
+    raise RuntimeError("the licence server\\ndoes not answer")
+"""
+
+
+def run_process(script: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
+    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / "examples" / script), *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600, check=False)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def run_main(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> Iterator[Callable[..., tuple[str | None, str]]]:
+    """Runs a script in this process, in a directory of its own; returns its exit message and what it printed."""
+    precision, threads = torch.get_float32_matmul_precision(), torch.get_num_threads()
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "mymodule.py").write_text(MODULE)
+
+    def run(script: str, *arguments: str) -> tuple[str | None, str]:
+        monkeypatch.setattr("torchrl_etdmpc.envs.tasks._tasks", dict(TASKS))  # as a new process would know them
+        sys.modules.pop("mymodule", None)
+        (tmp_path / "imported").unlink(missing_ok=True)
+        monkeypatch.setattr(sys, "argv", [script, *arguments])
+        message = None
+        try:
+            runpy.run_path(str(ROOT / "examples" / script), run_name="__main__")
+        except SystemExit as stop:
+            message = stop.code
+        return message, capfd.readouterr().out
+
+    yield run
+    sys.modules.pop("mymodule", None)
+    torch.set_float32_matmul_precision(precision)
+    torch.set_num_threads(threads)
+
+
+def import_tasks() -> dict:
+    from torchrl_etdmpc.envs import tasks
+
+    return dict(tasks._tasks)
+
+
+TASKS = import_tasks()
+
+
+def test_a_gymnasium_task_trains_in_an_empty_directory_with_an_action_repeat(tmp_path):
+    task = ("task=gym/Pendulum-v1", "task.action_repeat=2", "num_envs=2")
+    process = run_process("train.py", *task, *SMALL_RUN, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert "Warning" not in process.stderr
+    run_dir = tmp_path / "runs" / "gym" / "Pendulum-v1" / "cpu" / "seed3"
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert process.stdout.splitlines()[-1].startswith(
+        f"gym/Pendulum-v1: return {summary['final_return']:.1f} after 140 env steps in "
+    )
+    assert (summary["task"], summary["env_steps"]) == ("gym/Pendulum-v1", 140)
+    evaluations = read_rows(run_dir / "eval.csv")
+    assert [(row["env_steps"], row["decision_steps"]) for row in evaluations] == [("0", "0"), ("140", "70")]
+    assert -200 * 16.3 < summary["final_return"] < 0  # 200 env steps, of which none costs more
+    content = read_agent_file(run_dir / "checkpoints" / "last.pt")
+    assert content["config"]["action_repeat"] == 2
+    assert content["counters"]["updates"] == 4 + 30
+    assert not any("termination" in name for name in content["world_model"])  # Pendulum never terminates
+
+
+def test_a_task_of_the_user_s_own_file_is_trained_gone_on_with_evaluated_and_exported(tmp_path, run_main):
+    """What is stored names it, and every command must name it again: no file makes a process import code."""
+    name, limit = "task=mymodule:make_my_env", "task.episode_length=30"
+    message, out = run_main("train.py", name, limit, *SMALL_RUN, "run_dir=run")
+    assert message is None
+    assert out.splitlines()[-1].startswith("mymodule:make_my_env: return ")
+    assert [row["env_steps"] for row in read_rows(tmp_path / "run" / "eval.csv")] == ["0", "140"]
+    commands = {
+        "train.py": ("run_dir=run", "resume=true", *SMALL_RUN, "total_env_steps=160"),
+        "evaluate.py": ("checkpoint=run/checkpoints/last.pt", "episodes=1", "device=cpu", "policy=bare"),
+        "export.py": ("checkpoint=run/checkpoints/last.pt",),
+    }
+    for script, arguments in commands.items():
+        message, _ = run_main(script, *arguments)
+        assert "task 'mymodule:make_my_env' names code, which must be given on the command line: task=my" in message
+        assert message.startswith("error: ") and "\n" not in message
+        assert not (tmp_path / "imported").exists()
+        fresh = pytest.warns(UserWarning, match="^the environment cannot be restored, so fresh episodes begin")
+        with fresh if script == "train.py" else contextlib.nullcontext():
+            message, out = run_main(script, name, limit, *arguments)
+        assert message is None
+        assert out.splitlines()[-1].startswith("mymodule:make_my_env")
+        assert (tmp_path / "imported").exists()
+    assert [row["env_steps"] for row in read_rows(tmp_path / "run" / "eval.csv")] == ["0", "140", "160"]
+    assert (tmp_path / "exported" / "planner.pt2").exists()
+
+
+def test_a_task_that_terminates_against_its_word_is_an_error_that_names_the_remedy(run_main):
+    pytest.importorskip("mujoco")
+    message, _ = run_main("train.py", "task=gym/InvertedPendulum-v5", "task.terminates=false", *SMALL_RUN)
+    assert message == (
+        "error: an episode of gym/InvertedPendulum-v5 terminated, but the task is said never to; say "
+        "task.terminates=true (model.termination=false to bootstrap through its ends)."
+    )
+
+
+REFUSED = [
+    ("task=gym/Pendulm-v1", "unknown task 'gym/Pendulm-v1'; did you mean gym/Pendulum-v1, "),
+    ("task=gym/CartPole-v1", "gym/CartPole-v1 has discrete actions (Discrete); only continuous actions are supported."),
+    ("task=gym/Blackjack-v1", "Gymnasium sets no time limit for Blackjack-v1; give one in env steps: task.episode_"),
+    ("task=gym/Pendulum-v1 task.action_repeat=0", "action_repeat of task 'gym/Pendulum-v1' must be at least 1, got 0."),
+    ("task=gym/Pendulum-v1 task.episode_length=2", "loss.slice_len must fit into an episode of 2 decisions, got 3."),
+    ("task=nowhere:make", "task 'nowhere:make': there is no module 'nowhere' on Python's path or in "),
+    ("task=mymodule:nothing", "task 'mymodule:nothing': the module 'mymodule' ("),
+    ("task=mymodule:", "task 'mymodule:' must read package.module:attribute."),
+    ("task=mymodule:make_my_env", "task 'mymodule:make_my_env' shows no time limit; give one in env steps: task.epis"),
+    ("task=mymodule:make_nothing", "task 'mymodule:make_nothing' must return a TorchRL environment, got int."),
+    ("task=mymodule:fail", "the licence server does not answer"),
+    ("task=mymodule:make_unscaled", "task 'mymodule:make_unscaled': this environment cannot be used as it is: action"),
+    (
+        "task=mymodule:make_limited task.episode_length=500",
+        "episode_length of task 'mymodule:make_limited' must be at most 200, its environment's own limit, got 500.",
+    ),
+    (
+        "task=mymodule:make_limited task.action_repeat=2",
+        "action_repeat of task 'mymodule:make_limited' must be 1, which is how often its environment repeats an action",
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=[arguments for arguments, _ in REFUSED])
+def test_a_bad_task_ends_in_one_line_and_leaves_nothing_behind(tmp_path, run_main, arguments, message):
+    error, out = run_main("train.py", *arguments.split(), *SMALL_RUN)
+    assert error.startswith(f"error: {message}")
+    assert "\n" not in error
+    assert out == ""
+    assert {path.name for path in tmp_path.iterdir()} <= {"mymodule.py", "imported", "__pycache__"}
+
+
+def test_the_script_for_the_benchmarks_does_not_take_it(tmp_path, run_main):
+    message, out = run_main("train_dmc.py", "task=gym/Pendulum-v1", *SMALL_RUN)
+    assert message == "error: train_dmc.py knows the 28 DMC tasks, not 'gym/Pendulum-v1'; use examples/train.py."
+    assert out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["mymodule.py"]

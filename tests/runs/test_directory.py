@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import errno
+import gc
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from torchrl_etdmpc.runs import RunDirectory
+
+CONFIG = {"task": "walker-walk", "preset": "efficient-tdmpc-utd4", "seed": 1, "planner": {"horizon": 3, "lr": 3e-4}}
+
+
+def snapshot(directory: Path) -> dict[str, bytes]:
+    files = (path for path in directory.rglob("*") if path.name != ".lock")  # whoever closes it gives up its lock
+    return {str(path): path.read_bytes() if path.is_file() else b"" for path in files}
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> RunDirectory:
+    directory = RunDirectory(tmp_path / "run")
+    directory.begin(CONFIG)
+    return directory
+
+
+@pytest.fixture
+def elsewhere(in_copy) -> Callable[[Callable[[], None]], str | None]:
+    """What a function raises in another process, as one text; ``None`` if it returns."""
+
+    def run(function: Callable[[], None]) -> str | None:
+        read, write = os.pipe()
+
+        def told() -> None:
+            try:
+                function()
+            except Exception as error:
+                os.write(write, f"{type(error).__name__}: {error}".encode())
+
+        assert in_copy(told) == 0
+        os.close(write)
+        with os.fdopen(read) as pipe:
+            return pipe.read() or None
+
+    return run
+
+
+def test_the_names_of_the_files_are_those_that_other_programs_read():
+    directory = RunDirectory("runs/walker")
+    names = {name: str(path) for name, path in vars(directory).items() if isinstance(path, Path)}
+    assert names == {
+        "path": "runs/walker",
+        "config": "runs/walker/config.yaml",
+        "train": "runs/walker/train.csv",
+        "eval": "runs/walker/eval.csv",
+        "curve": "runs/walker/curve.png",
+        "summary": "runs/walker/summary.json",
+        "checkpoints": "runs/walker/checkpoints",
+        "last_agent": "runs/walker/checkpoints/last.pt",
+        "best_agent": "runs/walker/checkpoints/best.pt",
+        "tensorboard": "runs/walker/tensorboard",
+        "wandb_id": "runs/walker/wandb_id",
+    }
+    assert str(directory) == f"{directory}" == "runs/walker"
+
+
+def test_a_tilde_is_the_home_directory(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert RunDirectory("~/run").config == tmp_path / "run" / "config.yaml"
+
+
+def test_making_one_and_asking_it_touches_nothing(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    assert (directory.holds_a_run, directory.finished) == (False, False)
+    directory.require_new()
+    directory.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_begins_with_its_resolved_configuration_and_nothing_else(tmp_path):
+    directory = RunDirectory(tmp_path / "runs" / "walker")
+    directory.begin(CONFIG)
+    assert sorted(path.name for path in directory.path.iterdir()) == [".lock", "config.yaml"]
+    assert directory.read_config() == CONFIG
+    assert list(yaml.safe_load(directory.config.read_text())) == list(CONFIG)  # in the order of the settings
+    assert (directory.holds_a_run, directory.finished) == (True, False)
+    directory.close()
+    assert [path.name for path in directory.path.iterdir()] == ["config.yaml"]
+
+
+def test_a_run_may_begin_in_a_directory_that_holds_something_else(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    RunDirectory(tmp_path).begin(CONFIG)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("entry", ["config.yaml", "eval.csv", "train.csv", "summary.json", "checkpoints", "a link"])
+def test_a_directory_that_holds_a_run_is_refused_and_not_touched(tmp_path, entry):
+    if entry == "checkpoints":
+        (tmp_path / entry).mkdir()
+    elif entry == "a link":
+        (tmp_path / "eval.csv").symlink_to(tmp_path / "on a disk that is not there")
+    else:
+        (tmp_path / entry).write_text("old")
+    before = snapshot(tmp_path)
+    directory = RunDirectory(tmp_path)
+    for refuse in (directory.require_new, lambda: directory.begin(CONFIG)):
+        with pytest.raises(FileExistsError) as caught:
+            refuse()
+        assert str(caught.value) == f"run_dir={tmp_path} already holds a run; choose another run_dir or remove it."
+    assert directory.holds_a_run
+    assert snapshot(tmp_path) == before
+
+
+def test_a_configuration_that_yaml_cannot_hold_is_refused_before_anything_is_made(tmp_path):
+    with pytest.raises(ValueError, match=r"^config must hold plain dicts, .*, got device\(type='cpu'\); convert it"):
+        RunDirectory(tmp_path / "run").begin({"device": torch.device("cpu")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_yaml_is_named_before_anything_is_made(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(ImportError, match=r"needs PyYAML, which is not installed; run `pip install pyyaml`\.$"):
+        RunDirectory(tmp_path / "run").begin(CONFIG)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_that_cannot_be_made_is_one_clear_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    run_dir = tmp_path / "file" / "run"
+    with pytest.raises(OSError) as caught:
+        RunDirectory(run_dir).begin(CONFIG)
+    assert str(caught.value) == (
+        f"run_dir={run_dir} cannot be written (Not a directory); choose a directory that you can write to."
+    )
+
+
+def test_a_read_only_directory_is_one_clear_line(small_disk):
+    run_dir = small_disk / "run"
+    run_dir.mkdir()
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with pytest.raises(OSError) as caught:
+        RunDirectory(run_dir).begin(CONFIG)
+    assert str(caught.value) == (
+        f"run_dir={run_dir} cannot be written (Read-only file system); choose a directory that you can write to."
+    )
+
+
+@pytest.mark.parametrize("how", ["begin", "write_config"])
+def test_a_full_disk_is_one_clear_line_and_keeps_nobody_out(small_disk, leave_free, elsewhere, how):
+    directory = RunDirectory(small_disk / "run")
+    config = {**CONFIG, "note": "x" * 20_000}
+    if how == "write_config":
+        directory.begin(CONFIG)
+        directory.close()
+    else:
+        directory.path.mkdir()
+    before = snapshot(directory.path)
+    leave_free(small_disk, 4096)
+    with pytest.raises(OSError) as caught:
+        getattr(directory, how)(config)
+    assert str(caught.value) == (
+        f"run_dir={directory} cannot be written (No space left on device); choose a directory that you can write to."
+    )
+    assert snapshot(directory.path) == before
+    leave_free(small_disk, None)
+    assert elsewhere(lambda: getattr(RunDirectory(directory.path), how)(config)) is None
+
+
+def test_another_process_is_kept_out_until_the_run_is_closed(begun, elsewhere):
+    def go_on() -> None:
+        RunDirectory(begun.path).go_on()
+
+    busy = f"OSError: run_dir={begun} is in use by another process; wait for it or choose another run_dir."
+    before = snapshot(begun.path)
+    assert elsewhere(go_on) == busy
+    assert snapshot(begun.path) == before
+    begun.close()
+    begun.close()  # a second time is nothing
+    assert elsewhere(go_on) is None
+    begun.go_on()
+    assert elsewhere(go_on) == busy
+
+
+def test_of_two_processes_that_begin_at_once_only_one_does(begun, elsewhere):
+    """The other one looked before the configuration was there."""
+    begun.config.unlink()
+    message = elsewhere(lambda: RunDirectory(begun.path).begin(CONFIG | {"seed": 2}))
+    assert message == f"OSError: run_dir={begun} is in use by another process; wait for it or choose another run_dir."
+    assert not begun.config.exists()
+
+
+def test_a_run_that_began_between_the_look_and_the_lock_is_not_overwritten(tmp_path, monkeypatch, elsewhere):
+    directory, looked = RunDirectory(tmp_path / "run"), []
+    require_new = RunDirectory.require_new
+
+    def slow(self: RunDirectory) -> None:
+        require_new(self)
+        if not looked:
+            looked.append(True)
+            other = RunDirectory(self.path)
+            assert elsewhere(lambda: other.begin(CONFIG | {"seed": 2})) is None  # begins, and ends
+
+    monkeypatch.setattr(RunDirectory, "require_new", slow)
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        directory.begin(CONFIG)
+    assert directory.read_config()["seed"] == 2
+    assert elsewhere(lambda: directory.go_on()) is None  # and nobody is kept out
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
+def test_a_process_that_was_killed_keeps_nobody_out(tmp_path, in_copy):
+    directory = RunDirectory(tmp_path / "run")
+
+    def begin_and_die() -> None:
+        directory.begin(CONFIG)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    assert os.WIFSIGNALED(in_copy(begin_and_die))
+    assert (directory.path / ".lock").exists()
+    directory.go_on()
+    directory.close()
+    assert [path.name for path in directory.path.iterdir()] == ["config.yaml"]
+
+
+def test_a_directory_that_nobody_holds_on_to_is_unlocked(tmp_path, elsewhere):
+    RunDirectory(tmp_path / "run").begin(CONFIG)
+    gc.collect()
+    assert elsewhere(lambda: RunDirectory(tmp_path / "run").go_on()) is None
+
+
+def test_a_lock_that_its_owner_removed_in_the_last_moment_is_taken_again(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    lockf, calls = fcntl.lockf, []
+
+    def removed_first(*args):
+        calls.append(args)
+        if len(calls) == 1:
+            (tmp_path / ".lock").unlink()  # as the owner does between our opening the file and locking it
+        return lockf(*args)
+
+    monkeypatch.setattr(fcntl, "lockf", removed_first)
+    directory = RunDirectory(tmp_path)
+    directory.begin(CONFIG)
+    assert len(calls) == 2
+    assert os.fstat(calls[1][0]).st_ino == (tmp_path / ".lock").stat().st_ino
+    directory.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "lockf", no_locks)
+    directory = RunDirectory(tmp_path / "run")
+    directory.begin(CONFIG)
+    assert directory.read_config() == CONFIG
+
+
+def test_an_abandoned_run_leaves_its_directory_free(begun):
+    begun.abandon()
+    assert list(begun.path.iterdir()) == []
+    RunDirectory(begun.path).begin(CONFIG)
+
+
+def test_a_configuration_that_changed_is_stored_and_another_left_alone(begun):
+    begun.close()
+    before = begun.config.stat()
+    begun.go_on()
+    begun.write_config(CONFIG)
+    assert (begun.config.stat().st_ino, begun.config.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    begun.write_config(CONFIG | {"seed": 2})
+    assert begun.read_config() == CONFIG | {"seed": 2}
+
+
+def test_there_must_be_a_run_to_go_on_with(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    for look in (directory.read_config, lambda: directory.go_on()):
+        with pytest.raises(FileNotFoundError) as caught:
+            look()
+        assert str(caught.value) == f"run_dir={directory} holds no run to go on with; start it with resume=off."
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [b"a: [1, 2\nb", b"\xff\xfe\x00", b"a: \x00"])
+def test_a_configuration_that_is_not_yaml_is_one_clear_line(begun, content):
+    begun.config.write_bytes(content)
+    with pytest.raises(ValueError, match=r"config\.yaml is not a configuration: [^\n]+$"):
+        begun.read_config()
+
+
+def test_a_summary_ends_a_run(begun):
+    begun.summary.write_text("{}")
+    assert begun.finished

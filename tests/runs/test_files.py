@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import pickle
+from itertools import count
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_etdmpc.runs import DamagedFileError
+from torchrl_etdmpc.runs.files import link, read_tensors, remove_partial_files, replacing, write_tensors, write_whole
+
+OLD, NEW = b"old " * 1000, b"new " * 3000
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_file_is_replaced_by_what_was_written(tmp_path):
+    path = tmp_path / "notes.txt"
+    for content in ("first", b"\x00second", "dritte Zeile \N{LATIN SMALL LETTER A WITH DIAERESIS}\n"):
+        data = content.encode() if isinstance(content, str) else content
+        assert write_whole(path, content) == hashlib.sha256(data).hexdigest()
+        assert path.read_bytes() == data
+        assert names(tmp_path) == {"notes.txt"}
+
+
+def test_a_block_that_fails_leaves_the_file_as_it_was(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_bytes(OLD)
+    with pytest.raises(ZeroDivisionError), replacing(path) as partial:
+        partial.write_bytes(NEW)
+        _ = 1 / 0
+    assert path.read_bytes() == OLD
+    assert names(tmp_path) == {"notes.txt"}
+
+
+def test_the_temporary_name_lies_beside_the_file_keeps_its_suffix_and_is_hidden(tmp_path):
+    with replacing(tmp_path / "film.mp4") as partial:
+        assert (partial.parent, partial.suffix, partial.name[0]) == (tmp_path, ".mp4", ".")
+        partial.write_bytes(NEW)
+    assert names(tmp_path) == {"film.mp4"}
+
+
+def test_the_content_is_on_disk_before_the_name_is(tmp_path, monkeypatch):
+    path, events = tmp_path / "notes.txt", []
+    fsync, replace = os.fsync, os.replace
+
+    def synced(descriptor: int) -> None:
+        events.append(("sync", os.fstat(descriptor).st_ino))
+        fsync(descriptor)
+
+    def replaced(source: Path, target: Path) -> None:
+        events.append(("replace", Path(source).stat().st_ino))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    write_whole(path, NEW)
+    assert events[:2] == [("sync", path.stat().st_ino), ("replace", path.stat().st_ino)]
+
+
+WRITERS = {
+    "write_whole": lambda path: write_whole(path, NEW),
+    "write_tensors": lambda path: write_tensors(path, {"x": torch.arange(5000)}),
+    "link": lambda path: link(path.with_name("source"), path),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_process_that_is_killed_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path, killed_at, writer):
+    path, seen = tmp_path / "file", []
+    (tmp_path / "source").write_bytes(NEW)
+    write = WRITERS[writer]
+    write(path)
+    new = path.read_bytes()
+    for moment in count(1):
+        path.unlink()
+        path.write_bytes(OLD)
+        killed = killed_at(lambda: write(path), moment)
+        assert path.read_bytes() in (OLD, new)
+        seen.append(path.read_bytes() == new)
+        if not killed:
+            break
+    assert len(seen) >= 4  # making, writing, syncing and moving it
+    assert seen == sorted(seen) and seen[-1] and not seen[0]
+    assert len(names(tmp_path)) > 2  # those that were killed had no time to clean up
+    remove_partial_files(tmp_path)
+    assert names(tmp_path) == {"file", "source"}
+
+
+def test_partial_files_go_and_other_hidden_files_and_folders_stay(tmp_path):
+    for name in (".a.7.partial.pt", ".film.12.partial.mp4", ".notes.3.partial", ".lock", "partial.pt"):
+        (tmp_path / name).write_bytes(OLD)
+    (tmp_path / ".0001.partial").mkdir()
+    remove_partial_files(tmp_path)
+    assert names(tmp_path) == {".lock", "partial.pt", ".0001.partial"}
+
+
+def test_tensors_come_back_and_the_checksum_is_the_file_s(tmp_path):
+    content = {"x": torch.randn(3, 4), "n": 3, "list": [torch.arange(2), "text", None], "nested": {"y": 1.5}}
+    sha256 = write_tensors(tmp_path / "a.pt", content)
+    assert sha256 == hashlib.sha256((tmp_path / "a.pt").read_bytes()).hexdigest()
+    read = read_tensors(tmp_path / "a.pt", sha256)
+    assert torch.equal(read.pop("x"), content.pop("x"))
+    assert torch.equal(read["list"].pop(0), content["list"].pop(0))
+    assert read == content
+
+
+def test_a_file_that_is_missing_or_not_what_was_written_is_named(tmp_path):
+    path = tmp_path / "a.pt"
+    sha256 = write_tensors(path, {"x": torch.arange(100)})
+    data = path.read_bytes()
+    flipped = bytearray(data)
+    flipped[len(data) // 2] ^= 1
+    for damaged in (data[:-1], data[: len(data) // 2], b"", bytes(flipped), data + b"x"):
+        path.write_bytes(damaged)
+        with pytest.raises(DamagedFileError, match=r"a\.pt is not the file that was written: it is cut off or damaged"):
+            read_tensors(path, sha256)
+    path.unlink()
+    with pytest.raises(DamagedFileError, match=r"a\.pt cannot be read \(No such file or directory\)\.$"):
+        read_tensors(path, sha256)
+
+
+class Hostile:
+    def __reduce__(self):
+        return os.system, ("touch hostile_code_ran",)
+
+
+@pytest.mark.parametrize("kind", ["torch.save", "pickle", "noise"])
+def test_a_file_that_holds_anything_else_is_refused_even_if_its_checksum_is_right(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.pt"
+    if kind == "torch.save":
+        sha256 = write_tensors(path, {"rows": Hostile()})
+    else:
+        sha256 = write_whole(path, pickle.dumps(Hostile()) if kind == "pickle" else b"noise")
+    with pytest.raises(DamagedFileError, match="holds more than tensors and plain containers; it was not loaded"):
+        read_tensors(path, sha256)
+    assert names(tmp_path) == {"a.pt"}
+
+
+def test_a_link_is_the_same_file_and_replaces_an_old_one(tmp_path):
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.write_bytes(NEW)
+    target.write_bytes(OLD)
+    link(source, target)
+    assert os.path.samefile(source, target)
+    write_whole(source, OLD)  # which makes a new file, so the link keeps the content that it was made for
+    assert target.read_bytes() == NEW
+
+
+def test_a_link_is_a_copy_where_the_file_system_has_none(tmp_path, monkeypatch):
+    def no_links(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.write_bytes(NEW)
+    target.write_bytes(OLD)
+    link(source, target)
+    assert target.read_bytes() == NEW
+    assert not os.path.samefile(source, target)
+    assert names(tmp_path) == {"source", "target"}
+
+
+def test_a_full_disk_leaves_the_old_file_whole_whatever_space_is_left(small_disk, leave_free):
+    content = {"x": torch.arange(15_000)}  # 120 KB
+    path, taken = small_disk / "file.pt", []
+    before = {"x": torch.arange(10)}
+    for free in range(0, 200 * 1024, 4096):
+        leave_free(small_disk, None)
+        sha256 = write_tensors(path, before)
+        leave_free(small_disk, free)
+        try:
+            new = write_tensors(path, content)
+        except OSError as error:
+            assert error.errno == errno.ENOSPC
+            torch.testing.assert_close(read_tensors(path, sha256), before)
+        else:
+            torch.testing.assert_close(read_tensors(path, new), content)
+            taken.append(free)
+        assert names(small_disk) == {"file.pt", "ballast"}
+    assert taken and taken[0] > 120_000  # less would not hold the new one
+    assert taken == list(range(taken[0], 200 * 1024, 4096))
+
+
+def test_a_file_system_without_room_for_a_copy_of_a_link_says_so(small_disk, leave_free, monkeypatch):
+    def no_links(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    source, target = small_disk / "source", small_disk / "target"
+    source.write_bytes(bytes(100_000))
+    target.write_bytes(OLD)
+    leave_free(small_disk, 8192)
+    with pytest.raises(OSError, match="No space left on device"):
+        link(source, target)
+    assert target.read_bytes() == OLD
+    assert names(small_disk) == {"source", "target", "ballast"}
