@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from torchrl_etdmpc import export_planner, export_policy
-from torchrl_etdmpc.runs.files import replacing
+from torchrl_etdmpc.runs import replacing
 from torchrl_etdmpc.training import hydra_main, load_agent
 
 

@@ -2,7 +2,7 @@
 
 from torchrl_etdmpc.runs.directory import RunDirectory
 from torchrl_etdmpc.runs.errors import first_line
-from torchrl_etdmpc.runs.files import DamagedFileError
+from torchrl_etdmpc.runs.files import DamagedFileError, replacing
 from torchrl_etdmpc.runs.interval_means import IntervalMeans
 from torchrl_etdmpc.runs.log import COUNTER_COLUMNS, EVAL_COLUMNS, RunLog
 from torchrl_etdmpc.runs.loggers import LoggerName, make_logger, require_logger
@@ -23,6 +23,7 @@ __all__ = [
     "library_versions",
     "make_logger",
     "progress_bar",
+    "replacing",
     "require_logger",
     "write_mp4",
 ]
