@@ -301,13 +301,14 @@ def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, mak
 
 @pytest.mark.parametrize("stage", ["random", "pretrain", "learn"])
 def test_a_run_goes_on_in_the_stage_that_was_saved(tmp_path, stage, small_config, make_run):
-    run = make_run(small_config(), tmp_path)
+    config = small_config(total_env_steps=70, eval_every=1000)
+    run = make_run(config, tmp_path)
     for _ in range(30 if stage == "learn" else 24):
         run.learner.step()
     run.state.load_state_dict(run.state.state_dict() | {"stage": stage, "due": []})
     assert run.save()
     run.log.directory.close()
-    resumed = make_run(small_config(), tmp_path, resume=True)
+    resumed = make_run(config, tmp_path, resume=True)
     resumed.run()
     learned = resumed.learner.collector.frames - (30 if stage == "learn" else 24)
     assert resumed.learner.agent.updater.updates == (0 if stage == "learn" else 7) + 2 * learned

@@ -208,8 +208,8 @@ def test_a_checkpoint_is_written_when_the_last_one_is_some_minutes_old(tmp_path,
 def test_without_minutes_only_the_interval_asks_for_a_checkpoint(tmp_path, monkeypatch, tiny_config, make_run):
     clock = itertools.count(step=1e6)
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
-    make_run(tiny_config(checkpoint_minutes=None, checkpoint_keep=99), tmp_path).run()
-    assert sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir()) == [80, 160]
+    make_run(tiny_config(checkpoint_minutes=None, checkpoint_keep=99, total_env_steps=90), tmp_path).run()
+    assert sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir()) == [80, 90]
 
 
 def test_every_decision_after_the_seed_phase_is_stored_with_a_planner_s_target(finished):
