@@ -122,8 +122,8 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
             run.resume()  # before anything of the run is changed: it may not be possible
         elif plan.action == "start over":
             log.start_over()
-        directory.write_config(config.to_dict())
         directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
+        directory.write_config(config.to_dict())
         summary = run.run()
     return (
         f"{config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
