@@ -22,7 +22,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 import torch  # noqa: E402
 
-from torchrl_etdmpc.envs import DMC_TASKS, make_dmc_env  # noqa: E402
+from torchrl_etdmpc.envs import DMC_TASKS, make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     build_agent,
     build_collector,
@@ -56,7 +56,7 @@ def exercise(task: str, preset_name: str, device: torch.device) -> dict[str, obj
     replay_config = dataclasses.replace(base.replay, seed_decisions=SEED_DECISIONS, insertion="step")
     config = dataclasses.replace(base, task=task, compile="off", total_env_steps=1000, replay=replay_config)
     torch.manual_seed(0)
-    env = make_dmc_env(task, seed=0)
+    env = make_env(task, seed=0)
     sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     agent = build_agent(config, *sizes, device)
     replay = build_replay(config, device)

@@ -20,7 +20,7 @@ import torch
 from cpu_learning import RESULTS, SEEDS, TASKS, run
 
 from torchrl_etdmpc.collectors import evaluate
-from torchrl_etdmpc.envs import make_dmc_env
+from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.training import load_agent
 
@@ -34,7 +34,7 @@ def compare(checkpoint: Path) -> dict[str, float]:
     """Scores, elites and actions in both dtypes, from the same states with the same noise."""
     agent, _, _ = load_agent(checkpoint, compile_setting="off")
     states: list[torch.Tensor] = []
-    env = make_dmc_env(TASK, seed=1000).append_transform(agent.eval_planner.make_tensordict_primer())
+    env = make_env(TASK, seed=1000).append_transform(agent.eval_planner.make_tensordict_primer())
     torch.manual_seed(0)
     evaluate(env, agent.eval_planner, episodes=1, on_step=lambda step: states.append(step["observation"].clone()))
     env.close()

@@ -19,7 +19,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from torchrl_etdmpc.envs import make_dmc_env
+from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions
 from torchrl_etdmpc.training import (
     TrainConfig,
@@ -49,8 +49,8 @@ def run_for(decisions: int) -> pd.DataFrame:
     values["replay"] |= {"capacity": 10_000}
     config = TrainConfig.from_dict(values)
     torch.set_num_threads(config.threads)
-    env = make_dmc_env(config.task, seed=0)
-    eval_env = make_dmc_env(config.task, seed=1, num_envs=1)
+    env = make_env(config.task, seed=0)
+    eval_env = make_env(config.task, seed=1, num_envs=1)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         directory = RunDirectory(Path(folder) / "run")
@@ -92,7 +92,7 @@ def humanoid_row():
     """One transition as the collector stores it."""
     values = preset("cpu").to_dict() | {"task": "humanoid-walk", "compile": "off"}
     config = TrainConfig.from_dict(values)
-    env = make_dmc_env(config.task, seed=0)
+    env = make_env(config.task, seed=0)
     buffer = build_replay(config)
     build_collector(config, build_agent(config, *HUMANOID), env, buffer).step()
     env.close()

@@ -9,7 +9,7 @@ import torch
 from sized import DEVICE, VARIANTS, configure
 
 from torchrl_etdmpc.collectors import SeedPolicy
-from torchrl_etdmpc.envs import make_dmc_env
+from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog
 from torchrl_etdmpc.training import TrainConfig, TrainingRun, build_agent, build_collector, build_replay
 
@@ -22,8 +22,8 @@ ON_GPU = [*ON_CPU, "efficient-tdmpc-utd2", "efficient-tdmpc-utd4"]
 def begin(config: TrainConfig, folder) -> TrainingRun:
     """A run that has compiled, and has finished its random phase and pretraining."""
     parallel = DEVICE.type == "cuda"
-    env = make_dmc_env(config.task, seed=0, num_envs=config.num_envs, parallel=parallel)
-    eval_env = make_dmc_env(config.task, seed=1, num_envs=config.eval_episodes, parallel=False)
+    env = make_env(config.task, seed=0, num_envs=config.num_envs, parallel=parallel)
+    eval_env = make_env(config.task, seed=1, num_envs=config.eval_episodes, parallel=False)
     log = RunLog(RunDirectory(folder / "run"), total_env_steps=config.total_env_steps)
     run = TrainingRun(config, env=env, eval_env=eval_env, log=log)
     run.precompile()
@@ -85,7 +85,7 @@ def test_one_step_of_walker(measure, variant):
     The last holds the random policy of the random phase, which is measured apart too.
     """
     config = configure("cpu", "eager", task=TASK, num_envs=1, eval_episodes=1, total_env_steps=100_000)
-    env = make_dmc_env(TASK, seed=0)
+    env = make_env(TASK, seed=0)
     raw = env._env
     raw.reset()
     actions = itertools.cycle(torch.rand(500, 6) * 2 - 1)  # what the random policy would do: a still walker costs less

@@ -37,10 +37,10 @@ def small(**replay) -> TrainConfig:
 
 @pytest.mark.parametrize("storage", ["cpu", "run", "auto"])
 def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
-    from torchrl_etdmpc.envs import make_dmc_env
+    from torchrl_etdmpc.envs import make_env
 
     config = small(device=storage)
-    env = make_dmc_env(config.task, seed=0)
+    env = make_env(config.task, seed=0)
     agent = build_agent(config, 3, 1, "cuda")
     replay = build_replay(config, "cuda")
     reanalyze = build_reanalyze(config, agent, replay)

@@ -13,7 +13,7 @@ import torch
 pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.envs import make_dmc_env, make_env  # noqa: E402
+from torchrl_etdmpc.envs import make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     BarePolicy,
     TrainConfig,
@@ -90,7 +90,7 @@ def test_the_planner_s_returns_are_printed_in_one_line(tmp_path, checkpoint):
     assert process.stderr == ""
     assert list(tmp_path.iterdir()) == []
     agent, _, _ = load_agent(checkpoint)
-    env = make_dmc_env("cartpole-balance", seed=5).append_transform(agent.eval_planner.make_tensordict_primer())
+    env = make_env("cartpole-balance", seed=5).append_transform(agent.eval_planner.make_tensordict_primer())
     torch.manual_seed(5)
     assert process.stdout == closing_line(evaluate(env, agent.eval_planner, episodes=1), "planner") + "\n"
 
@@ -99,7 +99,7 @@ def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint,
     message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=2", "policy=bare", "seed=5", "device=cpu")
     assert (message, err) == (None, "")
     agent, _, _ = load_agent(checkpoint)
-    env = make_dmc_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
+    env = make_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
     assert out == closing_line(evaluate(env, BarePolicy(agent.world_model), episodes=2), "bare") + "\n"
     assert list(tmp_path.iterdir()) == []
 

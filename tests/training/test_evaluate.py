@@ -87,11 +87,11 @@ def test_a_return_is_the_sum_of_an_episode_s_rewards():
 
 def test_a_return_equals_that_of_an_independent_rollout():
     pytest.importorskip("dm_control")
-    from torchrl_etdmpc.envs import make_dmc_env
+    from torchrl_etdmpc.envs import make_env
 
     torch.manual_seed(0)
     policy = BarePolicy(WorldModel(5, 1, latent_dim=16, mlp_dim=16))
-    env, other = (make_dmc_env("cartpole-balance", seed=3).append_transform(StepCounter(25)) for _ in range(2))
+    env, other = (make_env("cartpole-balance", seed=3).append_transform(StepCounter(25)) for _ in range(2))
     rollout = other.rollout(100, policy)
     assert rollout.shape == (25,)
     returns = evaluate(env, policy, episodes=1)

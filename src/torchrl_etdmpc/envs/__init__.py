@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
-from torchrl_etdmpc.envs.make import make_dmc_env, make_env
+from torchrl_etdmpc.envs.make import make_env
 from torchrl_etdmpc.envs.render import render_frame
 from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, register_task
 from torchrl_etdmpc.envs.user_task import import_task
@@ -18,7 +18,6 @@ __all__ = [
     "get_task",
     "import_task",
     "load_simulator_state",
-    "make_dmc_env",
     "make_env",
     "register_task",
     "render_frame",

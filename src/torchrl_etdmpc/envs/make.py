@@ -6,7 +6,6 @@ import os
 import signal
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv
@@ -16,7 +15,7 @@ from torchrl_etdmpc.envs.dmc import dmc_maker
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
 
-__all__ = ["find_maker", "make_dmc_env", "make_env"]
+__all__ = ["find_maker", "make_env"]
 
 # How long a worker process outlives a signal to stop, in seconds.
 _GRACE_S = 10
@@ -82,18 +81,6 @@ def make_env(
     if seed is not None:
         env.set_seed(seed)
     return env
-
-
-def make_dmc_env(task: str | Task, **kwargs: Any) -> EnvBase:
-    """:func:`make_env` for the tasks of dm_control only.
-
-    >>> make_dmc_env("cartpole-balance").action_spec.shape
-    torch.Size([1])
-    """
-    task = get_task(task) if isinstance(task, str) else task
-    if task.suite != "dm_control":
-        raise ValueError(f"make_dmc_env needs a task of suite 'dm_control', got {task.name!r} of suite {task.suite!r}.")
-    return make_env(task, **kwargs)
 
 
 def find_maker(task: Task) -> Maker:
