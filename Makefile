@@ -14,7 +14,7 @@ READY := $(VENV)/.ready
 help:
 	@echo "make train   train on walker-stand on a CPU (RUN_DIR=runs/walker-stand, ARGS=\"more options\")"
 	@echo "make test    run the tests and the examples in docstrings, JOBS=2 files at a time (ARGS=\"pytest options\")"
-	@echo "make lint    check the code with ruff"
+	@echo "make lint    check style, format and types, as the commit hooks and CI do"
 	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
 	@echo "make clean   remove .venv, caches and build output; runs/ stays"
 	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
@@ -27,8 +27,11 @@ test: export OMP_NUM_THREADS ?= 1
 test: $(READY)
 	@$(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile $(ARGS)
 
+lint: export PYRIGHT_PYTHON_IGNORE_WARNINGS ?= 1# it would ask the network for newer versions of itself
 lint: $(READY)
 	@$(VENV)/bin/ruff check
+	@$(VENV)/bin/ruff format --check
+	@$(VENV)/bin/pyright
 
 bench: $(READY)
 	@if [ -d benchmarks ]; then $(VENV)/bin/python -m pytest benchmarks --benchmark-only $(ARGS); \

@@ -19,9 +19,10 @@ import pandas as pd
 import torch
 from cpu_learning import RESULTS, SEEDS, TASKS, run
 
+from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import make_dmc_env
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.training import evaluate, load_agent
+from torchrl_etdmpc.training import load_agent
 
 FOLDER = RESULTS / "bf16"
 TASK = "walker-stand"

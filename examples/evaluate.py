@@ -18,12 +18,12 @@ os.environ.setdefault("MUJOCO_GL", "egl" if filming else "disable")
 import torch  # noqa: E402
 from tensordict import TensorDictBase  # noqa: E402
 
+from torchrl_etdmpc.collectors import evaluate  # noqa: E402
 from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame  # noqa: E402
+from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
 from torchrl_etdmpc.runs import write_mp4  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
-    BarePolicy,
     TrainConfig,
-    evaluate,
     hydra_main,
     load_agent,
     read_agent_file,

@@ -12,13 +12,13 @@ actions in [-1, 1].
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from torchrl_etdmpc import export_planner, export_policy
+from torchrl_etdmpc.runs import replacing
 from torchrl_etdmpc.training import hydra_main, load_agent
 
 
@@ -39,6 +39,8 @@ class ExportConfig:
 def main(config: ExportConfig) -> None:
     """Exports, compares with the live agent, writes."""
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
+    if config.task not in (None, run.task):
+        raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
     model = agent.world_model
     policy = export_policy(model)
     planner = export_planner(agent.eval_planner, batch_size=config.batch_size)
@@ -54,11 +56,9 @@ def main(config: ExportConfig) -> None:
         torch.testing.assert_close(*actions)
     out = Path(config.out).expanduser()
     out.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings():
-        # Several weights share one piece of memory; that matters only on a device, and these are on the CPU.
-        warnings.filterwarnings("ignore", "No complete tensor found")
-        for name, program in (("policy", policy), ("planner", planner)):
-            torch.export.save(program, out / f"{name}.pt2")
+    for name, program in (("policy", policy), ("planner", planner)):
+        with replacing(out / f"{name}.pt2") as partial:
+            torch.export.save(program, partial)
     print(
         f"{run.task}: {out}/policy.pt2 and {out}/planner.pt2, observations {list(observation.shape)}, actions "
         f"{list(actions[0].shape)}, plan_mean {list(plan_mean.shape)}"

@@ -22,11 +22,13 @@ import pandas as pd  # noqa: E402
 
 from torchrl_etdmpc.analysis import (  # noqa: E402
     BENCHMARKS,
+    Benchmark,
     benchmark_of,
     compare,
     find_runs,
     get_benchmark,
     join_curves,
+    own_benchmark,
     read_curves,
     read_runs,
     write_report,
@@ -48,7 +50,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--out", default="report", help="folder of the report (default: report)")
     parser.add_argument("--all-tasks", action="store_true", help="all tasks of the benchmark, not only those with runs")
     parser.add_argument("--budget", type=int, help="env steps; default: the benchmark's")
-    parser.add_argument("--grid-step", type=int, default=100_000, help="env steps between points of the AUC's grid")
+    parser.add_argument("--grid-step", type=int, help="env steps between points of the AUC's grid (default: 100,000)")
     parser.add_argument("--vector", choices=("pdf", "svg"), help="write every figure in this format as well")
     parser.add_argument(
         "--watch", nargs="?", type=float, const=30.0, metavar="SECONDS", help="refresh when new rows arrive, until ^C"
@@ -78,15 +80,30 @@ def read(arguments: argparse.Namespace) -> pd.DataFrame:
     return join_curves(read_runs(paths, method=name) for name, paths in groups.items())
 
 
+def choose_benchmark(arguments: argparse.Namespace, runs: pd.DataFrame) -> Benchmark:
+    """The one asked for, or that of the runs' tasks; Gymnasium's and users' tasks are one of their own."""
+    present = list(dict.fromkeys(runs["task"]))
+    own = [task for task in present if "/" in task or ":" in task]
+    for task in present:
+        if task not in own:
+            benchmark_of([task])  # an unknown task is an error, one of another benchmark is left out
+    if arguments.benchmark:
+        return get_benchmark(arguments.benchmark)
+    if not own:
+        return benchmark_of(present)
+    if len(own) < len(present):
+        raise ValueError(f"{own[0]} is of no benchmark, other runs are; report them apart, or pass --benchmark.")
+    reached = runs.groupby(["method", "task", "seed"])["env_steps"].max().min()
+    return own_benchmark(own, max(int(reached), 1))
+
+
 def report(arguments: argparse.Namespace, references: list[pd.DataFrame]) -> str:
     """Writes the report; returns a line for the terminal."""
     runs = read(arguments)
     if runs.empty:
         raise ValueError("no evaluation in any of the runs yet; wait for the first row of eval.csv.")
     present = list(dict.fromkeys(runs["task"]))
-    benchmark = get_benchmark(arguments.benchmark) if arguments.benchmark else benchmark_of(present)
-    for task in present:
-        benchmark_of([task])  # an unknown task is an error, one of another benchmark is left out
+    benchmark = choose_benchmark(arguments, runs)
     tasks = tuple(task for task in benchmark.tasks if arguments.all_tasks or task in present)
     chosen = runs[runs["task"].isin(tasks)]
     if chosen.empty:
@@ -107,7 +124,7 @@ def report(arguments: argparse.Namespace, references: list[pd.DataFrame]) -> str
         tasks=tasks,
         methods=(*methods, *baselines),
         budget=arguments.budget,
-        grid_step=arguments.grid_step,
+        grid_step=arguments.grid_step or (100_000 if benchmark.name in BENCHMARKS else max(benchmark.budget // 10, 1)),
     )
     page = write_report(comparison, arguments.out, vector=arguments.vector)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]

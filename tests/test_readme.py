@@ -1,25 +1,71 @@
-"""The README's code runs as it is printed, and what it names exists."""
+"""The README's and the docs' code runs as it is printed, and what they name exists."""
 
 from __future__ import annotations
 
 import re
+import runpy
+import shlex
 from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
-from torchrl_etdmpc.training import PRESETS
+from torchrl_etdmpc.envs import check_env, import_task, make_env
+from torchrl_etdmpc.training import PRESETS, TrainConfig
+from torchrl_etdmpc.training.config import config_from_dict
 
 ROOT = Path(__file__).resolve().parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")),
+)
+TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in sorted(PAGES)}
+# A block that cannot run by itself is marked as "python fragment".
+BLOCKS = [(page, code) for page, text in TEXTS.items() for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
+COMMANDS = list(
+    dict.fromkeys(
+        line.replace("\\\n", " ")
+        for text in TEXTS.values()
+        for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
+        for line in re.findall(r"(?:.*\\\n)*.*\S.*", block)
+    )
+)
+
+
+def commands(beginning: str) -> list[str]:
+    found = [shlex.join(shlex.split(command, comments=True)) for command in COMMANDS if command.startswith(beginning)]
+    assert found
+    return found
+
+
+def run_block(code: str) -> dict:
+    torch.manual_seed(0)
+    names: dict = {}
+    exec(compile(code, "a block of the documentation", "exec"), names)
+    return names
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    """The docs' own task, where the docs put it."""
+    (code,) = (code for _, code in BLOCKS if "def make_my_env" in code)
+    (tmp_path / "mypkg").mkdir()
+    (tmp_path / "mypkg" / "mymodule.py").write_text(code, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
 
 
 @pytest.mark.filterwarnings("ignore:.*auto_register_policy_transforms.*:FutureWarning")
-def test_the_pipeline_of_the_readme_runs_and_trains_the_planner_s_own_weights():
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    torch.manual_seed(0)
-    names: dict = {}
-    exec(compile(code, "README.md", "exec"), names)
+@pytest.mark.parametrize(("page", "code"), BLOCKS, ids=[page for page, _ in BLOCKS])
+def test_a_block_of_python_runs_as_it_is_printed_and_a_pipeline_trains_the_planner_s_weights(page, code):
+    pytest.importorskip("gymnasium")
+    names = run_block(code)
+    if "collector" not in names:
+        assert page != "README.md"
+        return
     assert int(names["world_model"].version) == 200
     assert all(value.isfinite().all() for value in names["terms"].values())
     assert names["planner"].world_model is names["world_model"]
@@ -27,9 +73,59 @@ def test_the_pipeline_of_the_readme_runs_and_trains_the_planner_s_own_weights():
     assert names["buffer"][:]["plan", "version"].max() > 0
 
 
+def test_the_task_of_the_docs_keeps_the_contract(own_module):
+    pytest.importorskip("gymnasium")
+    task = import_task("mypkg.mymodule:make_my_env", terminates=False)
+    assert (task.episode_length, task.action_repeat) == (200, 1)
+    env = make_env(task, seed=0)
+    check_env(env)
+    env.close()
+
+
+@pytest.mark.parametrize("command", commands(".venv/bin/python examples/"))
+def test_a_command_names_settings_and_options_that_exist(command, own_module, monkeypatch, capsys):
+    pytest.importorskip("hydra")
+    pytest.importorskip("gymnasium")
+    words = shlex.split(command)
+    (script,) = (word for word in words if word.startswith("examples/"))
+    path, arguments = ROOT / script, words[words.index(script) + 1 :]
+    assert path.is_file()
+    if script.endswith("report.py"):
+        monkeypatch.setattr("sys.argv", [script, *arguments])
+        runpy.run_path(str(path))["parse"]()
+        return
+    arguments += [] if "--cfg" in arguments else ["--cfg", "job"]
+    monkeypatch.setattr("sys.argv", [script, *arguments])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # the script sets it; this restores it
+    runpy.run_path(str(path), run_name="__main__")  # prints the settings and does nothing else
+    settings = yaml.safe_load(capsys.readouterr().out)
+    kinds = {"train.py": "TrainConfig", "train_dmc.py": "TrainConfig", "evaluate.py": "EvaluateConfig"}
+    kind = kinds.get(path.name, "ExportConfig")
+    config_from_dict(TrainConfig if kind == "TrainConfig" else runpy.run_path(str(path))[kind], settings)
+
+
+@pytest.mark.parametrize("command", commands("make "))
+def test_a_target_of_make_exists(command):
+    targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)[1].split()
+    words = shlex.split(command)
+    assert {word for word in words[1:] if "=" not in word} <= set(targets)
+
+
+def test_every_script_that_is_named_exists():
+    scripts = {
+        script
+        for text in TEXTS.values()
+        for script in re.findall(r"(?:examples|benchmarks|tests|src)/[\w/]+\.py", text)
+    }
+    assert len(scripts) > 5
+    assert [script for script in sorted(scripts) if not (ROOT / script).is_file()] == []
+
+
 def test_the_table_of_presets_is_the_code_s():
     rows = re.findall(
-        r"^\| `([a-z0-9-]+)`[^|]*\| (\d) \| (\d), [a-z ]+\| (\d) \| (\d+) \| every (\w+) \|$", README, re.M
+        r"^\| `([a-z0-9-]+)`[^|]*\| (\d) \| (\d), [a-z ]+\| (\d) \| (\d+) \| every (\w+) \|$",
+        TEXTS["docs/presets.md"],
+        re.M,
     )
     assert {row[0] for row in rows} == set(PRESETS)
     for name, heads, horizon, updates, every, insertion in rows:
@@ -39,7 +135,29 @@ def test_the_table_of_presets_is_the_code_s():
         assert config.replay.insertion == insertion
 
 
-def test_every_file_that_the_readme_links_exists():
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
-    assert links
-    assert [link for link in links if not (ROOT / link).exists()] == []
+def anchors(page: Path) -> set[str]:
+    """What GitHub calls the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_file_and_heading_that_is_linked_exists(page):
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", TEXTS[page]) if not link.startswith("http")]
+    missing = []
+    for link in links:
+        file, _, heading = link.partition("#")
+        target = (ROOT / page).parent / file if file else ROOT / page
+        if not target.exists() or (heading and heading not in anchors(target)):
+            missing.append(link)
+    assert missing == []
+
+
+def test_the_pages_are_linked_from_the_readme():
+    assert [page for page in TEXTS if page != "README.md" and f"]({page})" not in TEXTS["README.md"]] == []
+
+
+def test_the_columns_that_the_docs_name_are_those_of_a_run():
+    from torchrl_etdmpc.runs import EVAL_COLUMNS
+
+    assert [column for column in EVAL_COLUMNS if f"`{column}`" not in TEXTS["docs/running.md"]] == []

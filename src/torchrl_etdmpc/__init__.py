@@ -27,7 +27,7 @@ from torchrl_etdmpc.planners import (
 )
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "AdaptiveScore",

@@ -268,9 +268,7 @@ def test_when_all_are_damaged_the_error_names_every_fault_and_nothing_is_changed
         damage(store.folder / "resume" / f"{step:012d}" / file, "missing")
     before, other = tree(store.folder), Work()
     state = other.state()
-    with pytest.raises(
-        CheckpointError, match=r"^cannot resume: .*counter\.pt cannot be read .*; .*layer\.pt cannot"
-    ):
+    with pytest.raises(CheckpointError, match=r"^cannot resume: .*counter\.pt cannot be read .*; .*layer\.pt cannot"):
         CheckpointStore(store.folder).load(other.parts, other.buffer)
     assert (tree(store.folder), other.state()) == (before, state)
 

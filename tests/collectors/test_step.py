@@ -28,7 +28,7 @@ from torchrl.envs import (
     TensorDictPrimer,
     TransformedEnv,
 )
-from torchrl.envs.utils import RandomPolicy, exploration_type
+from torchrl.envs.utils import exploration_type
 from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
 
 from torchrl_etdmpc import (
@@ -40,6 +40,7 @@ from torchrl_etdmpc import (
     StepSliceSampler,
     WorldModel,
 )
+from torchrl_etdmpc.planners import FunctionScore
 
 TRAJ_KEY = ("collector", "traj_ids")
 
@@ -708,23 +709,39 @@ def test_no_gradient_is_recorded():
     assert not row["action"].requires_grad
 
 
-def test_meanwhile_is_called_once_the_action_is_chosen_and_before_the_environment_steps():
-    seen = []
-    env, policy = LineEnv(), RandomPolicy(LineEnv().action_spec)
-    step = env._step
+def test_a_step_is_its_two_halves():
+    stored = []
+    for step in (lambda collector: collector.step(), lambda collector: collector.finish_step(collector.act())):
+        torch.manual_seed(0)
+        replay = make_replay()
+        collector = StepCollector(make_env((3, 5)), RandomActions(), replay_buffer=replay)
+        collector.set_seed(0)
+        rows = [step(collector) for _ in range(9)]
+        assert collector.frames == 18
+        assert all(row.batch_size == (2,) for row in rows)
+        stored.append(replay.storage[:])
+    assert (stored[0] == stored[1]).all()
 
-    def observed_step(tensordict):
-        seen.append("step")
-        return step(tensordict)
 
-    def act(tensordict):
-        seen.append("act")
-        return policy(tensordict)
-
-    env._step = observed_step
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
-    collector = StepCollector(env, act, replay_buffer=buffer)
+def test_between_the_halves_the_action_is_chosen_and_the_environment_has_not_stepped():
+    env, buffer = LineEnv(), make_replay()
+    collector = StepCollector(env, RandomActions(), replay_buffer=buffer)
     for number in range(3):
-        collector.step(lambda: seen.append((len(buffer), torch.is_grad_enabled())))
-        assert seen == ["act", (number, True), "step"]
-        seen.clear()
+        acted = collector.act()
+        assert torch.is_grad_enabled()
+        assert (len(buffer), env.steps, collector.frames) == (number, number, number)
+        action = acted["action"].clone()
+        stepped = collector.finish_step(acted)
+        assert torch.equal(stepped["action"], action)
+        assert (len(buffer), env.steps, collector.frames) == (number + 1, number + 1, number + 1)
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_that_a_plan_fell_back_is_in_the_step_and_not_in_the_buffer(lengths):
+    replay, planner = make_replay(), make_planner()
+    collector = StepCollector(make_env(lengths), planner, replay_buffer=replay)
+    assert not collector.step()["plan", "fallback"].any()
+    planner.score = FunctionScore(lambda returns: torch.full(returns.shape[:-3], torch.nan))
+    assert collector.step()["plan", "fallback"].all()
+    assert ("plan", "fallback") not in replay.storage[:].keys(True, True)
+    assert ("plan", "loc") in replay.storage[:].keys(True, True)

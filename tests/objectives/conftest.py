@@ -27,6 +27,39 @@ LOSSES = {
     "value": EfficientTDMPCValueLoss,
     "policy": EfficientTDMPCPolicyLoss,
 }
+_TRAINED_BY_TERM = {
+    "consistency": {"encoder", "dynamics"},
+    "reward": {"encoder", "dynamics", "reward"},
+    "value": {"encoder", "dynamics", "value"},
+    "termination": {"encoder", "dynamics", "termination"},
+    "policy": {"policy"},
+}
+_TERMS = {
+    "whole": ["consistency", "reward", "termination", "value", "policy"],
+    "model": ["consistency", "reward", "termination"],
+    "value": ["value"],
+    "policy": ["policy"],
+}
+_METRICS = {
+    "consistency": ["consistency_error"],
+    "reward": ["reward_error"],
+    "termination": ["termination_error"],
+    "value": ["value_error", "value_target"],
+    "policy": ["policy_kl", "policy_entropy", "kl_scale"],
+}
+_READ = {
+    "whole": ["observation", "next_observation", "action", "next_reward", "next_terminated", "plan_loc", "plan_scale"],
+    "model": ["observation", "next_observation", "action", "next_reward", "next_terminated"],
+    "value": ["observation", "next_observation", "action"],
+    "policy": ["observation", "next_observation", "action", "plan_loc", "plan_scale"],
+}
+_KEYS = {
+    "next_observation": ("next", "observation"),
+    "next_reward": ("next", "reward"),
+    "next_terminated": ("next", "terminated"),
+    "plan_loc": ("plan", "loc"),
+    "plan_scale": ("plan", "scale"),
+}
 
 
 @pytest.fixture(autouse=True)
@@ -123,6 +156,65 @@ def assert_same_output() -> Callable[..., None]:
             torch.testing.assert_close(actual[key], value, msg=lambda text, key=key: f"{key}: {text}", **tolerances)
 
     return check
+
+
+@pytest.fixture
+def world_model(make_world_model: Callable[..., WorldModel]) -> WorldModel:
+    """Small networks with a termination head."""
+    return make_world_model(termination=True)
+
+
+@pytest.fixture
+def loss(kind: str, make_loss: Callable[..., LossModule], world_model: WorldModel) -> LossModule:
+    """Each loss in turn."""
+    return make_loss(kind, world_model)
+
+
+@pytest.fixture
+def total() -> Callable[[TensorDict], Tensor]:
+    """Sums the terms of an output."""
+    return lambda out: sum(value for key, value in out.items() if key.startswith("loss_"))
+
+
+@pytest.fixture
+def terms_of() -> dict[str, list[str]]:
+    """The terms of each loss, by its name."""
+    return _TERMS
+
+
+@pytest.fixture
+def metrics_of() -> dict[str, list[str]]:
+    """The metrics of each term."""
+    return _METRICS
+
+
+@pytest.fixture
+def trained_by_term() -> dict[str, set[str]]:
+    """The networks that each term trains."""
+    return _TRAINED_BY_TERM
+
+
+@pytest.fixture
+def key_of() -> Callable[[str], str | tuple[str, str]]:
+    """The default key of what a loss reads, by the name of its keyword."""
+    return lambda name: _KEYS.get(name, name)
+
+
+@pytest.fixture
+def owned() -> Callable[[str], set[str]]:
+    """The networks that a loss trains, by its name."""
+    return lambda kind: set.union(*(_TRAINED_BY_TERM[term] for term in _TERMS[kind]))
+
+
+@pytest.fixture
+def keywords_of() -> Callable[..., dict[str, Tensor]]:
+    """What a loss reads from slices, as keyword arguments in the order of its in_keys."""
+
+    def keywords(kind: str, slices: TensorDict, *, termination: bool = True) -> dict[str, Tensor]:
+        names = [name for name in _READ[kind] if termination or name != "next_terminated"]
+        return {name: slices[_KEYS.get(name, name)] for name in names}
+
+    return keywords
 
 
 @pytest.fixture

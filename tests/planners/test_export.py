@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import zipfile
+from pathlib import Path
+
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel, export_planner, export_policy
 from torchrl_etdmpc.testing import LineWorld
+from torchrl_etdmpc.training import TrainConfig, build_agent
 
 
 def make_model(**options) -> WorldModel:
@@ -55,6 +60,46 @@ def test_a_compiled_plan_is_not_what_is_exported():
     planner.compiled_plan = fail
     export_planner(planner)
     assert planner.compiled_plan is fail
+
+
+def an_agents_planner() -> EnsembleMPPIPlanner:
+    """Its weights are views of a few pieces of memory."""
+    model = {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16}
+    planner = {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1}
+    config = TrainConfig.from_dict({"compile": "off", "model": model, "planner": planner})
+    return build_agent(config, 5, 2).eval_planner
+
+
+# A warning is an error here: PyTorch warns of tensors that are parts of others when it saves them.
+@pytest.mark.parametrize("make", [lambda: make_planner(make_model()), an_agents_planner])
+def test_a_file_holds_the_weights_that_its_program_needs_and_nothing_else(make, tmp_path):
+    planner = make()
+    model, files = planner.world_model, [tmp_path / "policy.pt2", tmp_path / "planner.pt2"]
+    for program, file in zip([export_policy(model), export_planner(planner)], files, strict=True):
+        torch.export.save(program, file)
+    networks = [parameters_to_vector(part.parameters()).nbytes for part in (model.encoder, model.policy, model)]
+    buffers = sum(buffer.nbytes for buffer in model.buffers())
+    assert [stored_bytes(file) for file in files] == [sum(networks[:2]) + buffers, networks[2] + buffers]
+
+
+def stored_bytes(path: Path) -> int:
+    with zipfile.ZipFile(path) as file:
+        return sum(entry.file_size for entry in file.infolist() if "/data/weights/weight_" in entry.filename)
+
+
+def test_an_exported_program_does_not_follow_the_live_weights():
+    model, observation = make_model(), torch.randn(1, 5)
+    policy, planner = export_policy(model).module(), export_planner(make_planner(model)).module()
+
+    def act() -> list[torch.Tensor]:
+        torch.manual_seed(0)
+        return [policy(observation), planner(observation, torch.zeros(1, 3, 2))[0]]
+
+    before = act()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.5)
+    torch.testing.assert_close(act(), before, rtol=0, atol=0)
 
 
 def test_no_batch_is_refused():

@@ -160,3 +160,27 @@ def test_a_seed_makes_no_difference():
 def test_a_head_that_does_not_exist_is_refused(head):
     with pytest.raises(ValueError, match=rf"^head must be in 0\.\.2 or None, got {head}\.$"):
         LatentEnv(make_model(), head=head)
+
+
+def test_a_model_that_lacks_a_member_is_told_which():
+    class Half(torch.nn.Module):
+        observation_dim, action_dim, latent_dim, num_dynamics = 3, 2, 3, 1
+        encode = next = reward = values = policy = staticmethod(torch.zeros_like)
+
+    with pytest.raises(
+        TypeError,
+        match=r"^world_model must have the members of PredictionModel, got Half without version, termination, act; see "
+        r"torchrl_etdmpc\.modules\.PredictionModel\.$",
+    ):
+        LatentEnv(Half())
+
+
+def test_a_model_that_is_no_module_is_refused():
+    class Plain:
+        observation_dim, action_dim, latent_dim, num_dynamics, version = 3, 2, 3, 1, torch.zeros((), dtype=torch.int64)
+        encode = next = reward = values = policy = termination = act = staticmethod(torch.zeros_like)
+
+    with pytest.raises(
+        TypeError, match=r"^world_model must be a torch\.nn\.Module, got Plain; derive it from nn\.Module\.$"
+    ):
+        LatentEnv(Plain())

@@ -152,11 +152,11 @@ def test_a_read_only_directory_is_one_clear_line(small_disk):
     )
 
 
-@pytest.mark.parametrize("how", ["begin", "go_on"])
+@pytest.mark.parametrize("how", ["begin", "write_config"])
 def test_a_full_disk_is_one_clear_line_and_keeps_nobody_out(small_disk, leave_free, elsewhere, how):
     directory = RunDirectory(small_disk / "run")
     config = {**CONFIG, "note": "x" * 20_000}
-    if how == "go_on":
+    if how == "write_config":
         directory.begin(CONFIG)
         directory.close()
     else:
@@ -175,7 +175,7 @@ def test_a_full_disk_is_one_clear_line_and_keeps_nobody_out(small_disk, leave_fr
 
 def test_another_process_is_kept_out_until_the_run_is_closed(begun, elsewhere):
     def go_on() -> None:
-        RunDirectory(begun.path).go_on(CONFIG)
+        RunDirectory(begun.path).go_on()
 
     busy = f"OSError: run_dir={begun} is in use by another process; wait for it or choose another run_dir."
     before = snapshot(begun.path)
@@ -184,7 +184,7 @@ def test_another_process_is_kept_out_until_the_run_is_closed(begun, elsewhere):
     begun.close()
     begun.close()  # a second time is nothing
     assert elsewhere(go_on) is None
-    begun.go_on(CONFIG)
+    begun.go_on()
     assert elsewhere(go_on) == busy
 
 
@@ -211,7 +211,7 @@ def test_a_run_that_began_between_the_look_and_the_lock_is_not_overwritten(tmp_p
     with pytest.raises(FileExistsError, match="already holds a run"):
         directory.begin(CONFIG)
     assert directory.read_config()["seed"] == 2
-    assert elsewhere(lambda: directory.go_on(CONFIG | {"seed": 2})) is None  # and nobody is kept out
+    assert elsewhere(lambda: directory.go_on()) is None  # and nobody is kept out
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
@@ -224,7 +224,7 @@ def test_a_process_that_was_killed_keeps_nobody_out(tmp_path, in_copy):
 
     assert os.WIFSIGNALED(in_copy(begin_and_die))
     assert (directory.path / ".lock").exists()
-    directory.go_on(CONFIG)
+    directory.go_on()
     directory.close()
     assert [path.name for path in directory.path.iterdir()] == ["config.yaml"]
 
@@ -232,7 +232,7 @@ def test_a_process_that_was_killed_keeps_nobody_out(tmp_path, in_copy):
 def test_a_directory_that_nobody_holds_on_to_is_unlocked(tmp_path, elsewhere):
     RunDirectory(tmp_path / "run").begin(CONFIG)
     gc.collect()
-    assert elsewhere(lambda: RunDirectory(tmp_path / "run").go_on(CONFIG)) is None
+    assert elsewhere(lambda: RunDirectory(tmp_path / "run").go_on()) is None
 
 
 def test_a_lock_that_its_owner_removed_in_the_last_moment_is_taken_again(tmp_path, monkeypatch):
@@ -272,19 +272,19 @@ def test_an_abandoned_run_leaves_its_directory_free(begun):
     RunDirectory(begun.path).begin(CONFIG)
 
 
-def test_going_on_stores_a_configuration_that_changed_and_leaves_another_alone(begun):
+def test_a_configuration_that_changed_is_stored_and_another_left_alone(begun):
     begun.close()
     before = begun.config.stat()
-    begun.go_on(CONFIG)
+    begun.go_on()
+    begun.write_config(CONFIG)
     assert (begun.config.stat().st_ino, begun.config.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
-    begun.close()
-    begun.go_on(CONFIG | {"seed": 2})
+    begun.write_config(CONFIG | {"seed": 2})
     assert begun.read_config() == CONFIG | {"seed": 2}
 
 
 def test_there_must_be_a_run_to_go_on_with(tmp_path):
     directory = RunDirectory(tmp_path / "run")
-    for look in (directory.read_config, lambda: directory.go_on(CONFIG)):
+    for look in (directory.read_config, lambda: directory.go_on()):
         with pytest.raises(FileNotFoundError) as caught:
             look()
         assert str(caught.value) == f"run_dir={directory} holds no run to go on with; start it with resume=off."

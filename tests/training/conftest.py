@@ -45,7 +45,7 @@ def _make_run(config: TrainConfig, run_dir: Path, *transforms: Transform, resume
     torch.manual_seed(99 if resume else 0)
 
     def make(num_envs: int, seed: int, *more: Transform) -> EnvBase:
-        env = make_env(config.task, seed=seed, num_envs=num_envs, parallel=False)
+        env = make_env(config.task_spec, seed=seed, num_envs=num_envs, parallel=False)
         for transform in (StepCounter(EPISODE), *more):
             env = env.append_transform(transform)
         return env
@@ -54,9 +54,12 @@ def _make_run(config: TrainConfig, run_dir: Path, *transforms: Transform, resume
     log = RunLog(directory, total_env_steps=config.total_env_steps)
     env = make(config.num_envs, 90 if resume else 0, *transforms)
     run = TrainingRun(config, env=env, eval_env=make(config.eval_episodes, 1), log=log)
-    (directory.go_on if resume else directory.begin)(config.to_dict())
     if resume:
+        directory.go_on()
         run.resume()
+        directory.write_config(config.to_dict())
+    else:
+        directory.begin(config.to_dict())
     return run
 
 

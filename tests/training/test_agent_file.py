@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import random
 from pathlib import Path
@@ -17,18 +18,18 @@ from torchrl_etdmpc.training import (
     TrainConfig,
     build_agent,
     load_agent,
-    read_checkpoint,
-    save_checkpoint,
+    read_agent_file,
+    save_agent,
 )
-from torchrl_etdmpc.training.checkpoint import FORMAT
+from torchrl_etdmpc.training.agent_file import FORMAT
 
 OBSERVATION_DIM, ACTION_DIM = 3, 1
 COUNTERS = {"env_steps": 100, "decision_steps": 50, "updates": 3, "wall_time_s": 1.5}
 
 
-def make_config(mlp_dim: int = 16) -> TrainConfig:
-    sizes = {"latent_dim": 16, "mlp_dim": mlp_dim, "encoder_dim": 16, "num_dynamics": 2}
-    return TrainConfig.from_dict({"task": "pendulum-swingup", "compile": "off", "model": sizes})
+@pytest.fixture(scope="module")
+def config(tiny_config) -> TrainConfig:
+    return tiny_config(task="pendulum-swingup")
 
 
 def train(agent: Agent, updates: int, seed: int) -> None:
@@ -62,15 +63,14 @@ def torch_bytes(content: Any) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Agent, TrainConfig]:
-    """A checkpoint and what it was made of; tests that write make a copy."""
-    config = make_config()
+def saved(tmp_path_factory: pytest.TempPathFactory, config) -> tuple[Path, Agent, TrainConfig]:
+    """An agent file and what it was made of; tests that write make a copy."""
     agent = trained_agent(config)
-    path = save_checkpoint(tmp_path_factory.mktemp("run") / "checkpoints" / "last.pt", agent, config, COUNTERS)
+    path = save_agent(tmp_path_factory.mktemp("run") / "checkpoints" / "last.pt", agent, config, COUNTERS)
     return path, agent, config
 
 
-def refusal(path: Path, read=read_checkpoint) -> str:
+def refusal(path: Path, read=read_agent_file) -> str:
     with pytest.raises(CheckpointError) as caught:
         read(path)
     message = str(caught.value)
@@ -80,7 +80,7 @@ def refusal(path: Path, read=read_checkpoint) -> str:
     return message.removeprefix(str(path)).strip()
 
 
-def test_a_checkpoint_restores_every_tensor_the_configuration_and_the_counters(saved):
+def test_an_agent_file_restores_every_tensor_the_configuration_and_the_counters(saved):
     path, agent, config = saved
     torch.manual_seed(99)
     loaded, loaded_config, counters = load_agent(path)
@@ -111,10 +111,9 @@ def test_the_saved_tensors_differ_from_those_of_a_new_agent(saved):
     assert unchanged == []
 
 
-def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(tmp_path):
-    config = make_config()
+def test_training_goes_on_from_an_agent_file_as_if_it_had_not_stopped(tmp_path, config):
     agent = trained_agent(config)
-    loaded, _, _ = load_agent(save_checkpoint(tmp_path / "last.pt", agent, config, COUNTERS))
+    loaded, _, _ = load_agent(save_agent(tmp_path / "last.pt", agent, config, COUNTERS))
     for one in (agent, loaded):
         train(one, 2, seed=5)
     expected, actual = tensors(agent), tensors(loaded)
@@ -131,44 +130,43 @@ def test_a_loaded_agent_s_planners_see_the_loaded_weights(saved):
         assert torch.equal(plans[0].mean, plans[1].mean)
 
 
-def test_the_weights_are_written_once(tmp_path):
-    config = make_config(mlp_dim=128)
+def test_the_weights_are_written_once(tmp_path, tiny_config):
+    config = tiny_config(task="pendulum-swingup", model={"mlp_dim": 128})
     torch.manual_seed(0)
     agent = build_agent(config, OBSERVATION_DIM, ACTION_DIM)
     train(agent, 1, seed=1)
-    size = save_checkpoint(tmp_path / "last.pt", agent, config, COUNTERS).stat().st_size
+    size = save_agent(tmp_path / "last.pt", agent, config, COUNTERS).stat().st_size
     unique = {value.data_ptr(): value.numel() * value.element_size() for value in tensors(agent).values()}
     weights = sum(parameter.numel() * parameter.element_size() for parameter in agent.world_model.parameters())
     assert sum(unique.values()) > 3 * weights  # the weights and Adam's two moments
     assert size < sum(unique.values()) + 0.5 * weights
 
 
-def test_a_checkpoint_leaves_nothing_beside_it_and_makes_its_folder(saved):
+def test_an_agent_file_leaves_nothing_beside_it_and_makes_its_folder(saved):
     path, _, _ = saved
     assert [entry.name for entry in path.parent.iterdir()] == ["last.pt"]
 
 
-def test_a_newer_checkpoint_replaces_the_older(tmp_path, saved):
+def test_a_newer_file_replaces_the_older(tmp_path, saved):
     _, agent, config = saved
     path = tmp_path / "last.pt"
     for updates in (3, 4):
-        save_checkpoint(str(path), agent, config, {"updates": updates})
-    assert read_checkpoint(path)["counters"] == {"updates": 4}
+        save_agent(str(path), agent, config, {"updates": updates})
+    assert read_agent_file(path)["counters"] == {"updates": 4}
     assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
 
 
 def test_a_save_that_fails_keeps_the_old_file_and_leaves_no_other(tmp_path, saved, monkeypatch):
     _, agent, config = saved
-    path = save_checkpoint(tmp_path / "last.pt", agent, config, COUNTERS)
+    path = save_agent(tmp_path / "last.pt", agent, config, COUNTERS)
     before = path.read_bytes()
 
-    def fill_the_disk(content, file):
-        Path(file).write_bytes(before[:1000])
+    def fill_the_disk(descriptor):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(torch, "save", fill_the_disk)
+    monkeypatch.setattr(os, "fsync", fill_the_disk)
     with pytest.raises(OSError, match="No space left"):
-        save_checkpoint(path, agent, config, COUNTERS)
+        save_agent(path, agent, config, COUNTERS)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
 
@@ -226,8 +224,8 @@ def test_another_pytorch_file_is_refused(tmp_path, content):
 
 
 def edited(saved: tuple, path: Path, **changes: Any) -> Path:
-    """A copy of the checkpoint with other entries; ``None`` removes one."""
-    content = read_checkpoint(saved[0]) | changes
+    """A copy of the file with other entries; ``None`` removes one."""
+    content = read_agent_file(saved[0]) | changes
     torch.save({name: value for name, value in content.items() if value is not None}, path)
     return path
 
@@ -237,7 +235,7 @@ def test_another_format_is_refused(tmp_path, saved):
     assert refusal(path) == f"has checkpoint format {FORMAT + 1}; this version reads format {FORMAT}."
 
 
-def test_a_checkpoint_that_lacks_entries_is_refused_with_their_names(tmp_path, saved):
+def test_an_agent_file_that_lacks_entries_is_refused_with_their_names(tmp_path, saved):
     path = edited(saved, tmp_path / "part.pt", updater=None, counters=None)
     assert refusal(path) == "is not a whole checkpoint: it lacks counters, updater."
 
@@ -263,7 +261,7 @@ def test_an_environment_of_the_same_size_is_accepted(saved):
 
 
 @pytest.mark.parametrize("change", [{"mlp_dim": 32}, {"latent_dim": 20}, {"layers": 3}])
-def test_weights_that_do_not_fit_their_configuration_are_refused(tmp_path, saved, change):
+def test_weights_that_do_not_fit_their_configuration_are_refused(tmp_path, saved, change, config):
     config = saved[2].to_dict()
     path = edited(saved, tmp_path / "odd.pt", config={**config, "model": {**config["model"], **change}})
     assert refusal(path, load_agent).startswith("does not fit its own configuration (")
@@ -279,3 +277,41 @@ def test_compilation_can_be_overridden_on_loading(tmp_path, saved, monkeypatch):
     _, config, _ = load_agent(path)
     assert config.compile == "default"
     assert calls != []
+
+
+def test_an_agent_file_of_the_code_before_is_read(tmp_path, saved):
+    # The same entries; its settings had no task of their own, a plain flag for the termination head, and a dtype.
+    _, agent, config = saved
+    settings = config.to_dict()
+    for name in ("action_repeat", "episode_length", "terminates"):
+        del settings[name]
+    settings["model"]["termination"] = False
+    settings["planner"]["scoring_dtype"] = settings["reanalyze"]["scoring_dtype"] = "float32"
+    content = {
+        "format": 2,
+        "config": settings,
+        "observation_dim": OBSERVATION_DIM,
+        "action_dim": ACTION_DIM,
+        "world_model": agent.world_model.state_dict(),
+        "loss": agent.loss.state_dict(),
+        "updater": agent.updater.state_dict(),
+        "counters": COUNTERS,
+    }
+    assert set(content["updater"]) == {"optimizer", "skipped", "skipped_in_a_row"}
+    path = tmp_path / "old.pt"
+    torch.save(content, path)
+    loaded, loaded_config, counters = load_agent(path)
+    expected, actual = tensors(agent), tensors(loaded)
+    assert [name for name in expected if not torch.equal(actual[name], expected[name])] == []
+    assert counters == COUNTERS
+    assert loaded_config.task_spec == config.task_spec
+    assert loaded.world_model.termination_head is None
+    observation, noise = torch.randn(2, OBSERVATION_DIM), agent.planner.draw_noise(2)
+    plans = [one.planner.plan(observation, noise=noise) for one in (agent, loaded)]
+    assert torch.equal(plans[0].mean, plans[1].mean)  # naming the weights' own dtype changes nothing
+
+
+def test_an_agent_file_with_a_task_in_code_asks_for_it_on_the_command_line(tmp_path, saved):
+    path = edited(saved, tmp_path / "user.pt", config={**saved[2].to_dict(), "task": "os:getcwd"})
+    message = refusal(path, load_agent)
+    assert "task 'os:getcwd' names code, which must be given on the command line: task=os:getcwd" in message

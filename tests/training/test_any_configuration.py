@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,8 +13,9 @@ from hypothesis import strategies as st
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
-from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun  # noqa: E402
+from torchrl_etdmpc.envs import make_env  # noqa: E402
+from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
+from torchrl_etdmpc.training import TrainConfig, TrainingRun  # noqa: E402
 
 
 def mostly(valid: st.SearchStrategy, *bad: Any) -> st.SearchStrategy:
@@ -26,6 +28,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
     {
         "task": st.sampled_from(["cartpole-swingup", "reacher-easy", "walker-walk", "finger-turn-hard", "dog-run"]),
         "num_envs": st.sampled_from([1, 1, 2]),
+        "episode_length": st.sampled_from([12, 13]),  # of two env steps a decision; the suite's own are 500 decisions
         "overlap": st.booleans(),
         "model": st.fixed_dictionaries(
             {
@@ -39,7 +42,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
                 "num_bins": mostly(st.sampled_from([2, 3, 21]), 1),
                 "dropout": mostly(st.sampled_from([0.0, 0.1]), 1.0),
                 "activation": st.sampled_from(["mish", "silu", "relu"]),
-                "termination": st.booleans(),
+                "termination": st.sampled_from([None, False, True]),
             }
         ),
         "planner": st.fixed_dictionaries(
@@ -52,7 +55,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
                 "score": st.sampled_from(["final", "mean", "adaptive"]),
                 "beta": mostly(st.sampled_from([0.0, 2.0]), -1.0),
                 "first_action": st.sampled_from(["elite", "mean", "best"]),
-                "scoring_dtype": st.sampled_from(["float32", "bfloat16"]),
+                "scoring_dtype": st.sampled_from([None, "bfloat16"]),
             }
         ),
         "reanalyze": st.fixed_dictionaries(
@@ -85,20 +88,27 @@ CONFIGURATIONS = st.fixed_dictionaries(
 def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values: dict[str, Any], seed: int):
     steps = 2 * values["replay"]["seed_decisions"] + 12
     values |= {"preset": "cpu", "compile": "off", "eval_episodes": 1, "log_every": 4, "total_env_steps": steps}
+    run_dir = tmp_path_factory.mktemp("runs") / "run"
+    torch.manual_seed(seed)
     try:
         config = TrainConfig.from_dict(values)
+        run = new_run(config, run_dir, seed)
     except ValueError as error:
         assert "\n" not in str(error)
         assert any(name in str(error) for group in values.values() if isinstance(group, dict) for name in group)
+        assert not run_dir.exists()
         return
-    torch.manual_seed(seed)
-    env = make_dmc_env(config.task, seed=seed, num_envs=config.num_envs, parallel=False)
-    eval_env = make_dmc_env(config.task, seed=seed)
-    eval_env._env._step_limit = 6
-    run_dir = tmp_path_factory.mktemp("run")
-    log = RunLog.create(run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps)
+    run.log.directory.begin(config.to_dict())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        summary = TrainingRun(config, env=env, eval_env=eval_env, log=log).run()
+        summary = run.run()
+    run.log.directory.close()
     assert summary["env_steps"] >= steps
     assert (run_dir / "summary.json").exists()
+
+
+def new_run(config: TrainConfig, run_dir: Path, seed: int) -> TrainingRun:
+    """A run on environments with the configuration's own time limit."""
+    env = make_env(config.task_spec, seed=seed, num_envs=config.num_envs, parallel=False)
+    log = RunLog(RunDirectory(run_dir), total_env_steps=config.total_env_steps)
+    return TrainingRun(config, env=env, eval_env=make_env(config.task_spec), log=log)

@@ -1,180 +1,20 @@
 from __future__ import annotations
 
-import dataclasses
-import shutil
-from typing import Any
-
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_etdmpc.planners.scores import FinalScore, MeanScore
-from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import (
-    Agent,
-    TrainConfig,
     build_agent,
     build_collector,
-    build_planner,
     build_reanalyze,
     build_replay,
-    build_world_model,
-    preset,
     resolve_device,
     row_bytes,
 )
 from torchrl_etdmpc.training.builders import replay_device
-from torchrl_etdmpc.training.config import PlannerConfig, ReanalyzeConfig
 
 OBSERVATION_DIM, ACTION_DIM = 5, 2
-COMPILE_OPTIONS = {"options": {"fallback_random": True, "cpp_wrapper": True}, "dynamic": False, "fullgraph": True}
-PLANNERS = ("planner", "eval_planner", "reanalyze_planner")
-
-
-def tiny_config(**changes: Any) -> TrainConfig:
-    """Networks and planners that cost next to nothing; a group is changed by a dictionary."""
-    values: dict[str, Any] = {
-        "compile": "off",
-        "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
-        "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 2},
-        "reanalyze": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 2},
-    }
-    for name, change in changes.items():
-        values[name] = {**values.get(name, {}), **change} if isinstance(change, dict) else change
-    return TrainConfig.from_dict(values)
-
-
-def tiny_agent(action_dim: int = ACTION_DIM, **changes: Any) -> Agent:
-    torch.manual_seed(0)
-    return build_agent(tiny_config(**changes), OBSERVATION_DIM, action_dim)
-
-
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, dict]]:
-    """Records what would be compiled, and with which options, without compiling it."""
-    calls: list[tuple[Any, dict]] = []
-
-    def compile(function: Any, **options: Any) -> Any:
-        calls.append((function, options))
-        return function
-
-    monkeypatch.setattr(torch, "compile", compile)
-    return calls
-
-
-@pytest.mark.parametrize("name", ["efficient-tdmpc-utd4", "bmpc", "cpu"])
-def test_the_networks_have_the_sizes_of_the_preset(name):
-    config = preset(name).model
-    model = build_world_model(config, OBSERVATION_DIM, ACTION_DIM)
-    weights = {name: parameter.shape for name, parameter in model.named_parameters()}
-    assert weights["encoder.hidden.0.weight"][-2:] == (OBSERVATION_DIM, config.encoder_dim)
-    assert "encoder.hidden.1.weight" not in weights
-    assert weights["dynamics.hidden.1.weight"] == (config.num_dynamics, config.mlp_dim, config.mlp_dim)
-    assert weights["value_head.output.weight"] == (config.num_values, config.mlp_dim, config.num_bins)
-    assert weights["policy.output.weight"][-1] == 2 * ACTION_DIM
-    assert model.encode(torch.zeros(OBSERVATION_DIM)).shape == (config.latent_dim,)
-    assert (model.bins[0].item(), model.bins[-1].item(), len(model.bins)) == (-10, 10, 101)
-    assert model.policy.log_std_bounds == (-3, 1)
-    assert [layer.dropout for layer in model.value_head.hidden] == [0.01, 0]
-    assert model.termination_head is None
-
-
-def test_the_networks_that_no_preset_changes_can_be_changed():
-    options = {"encoder_layers": 2, "dropout": 0.25, "activation": "relu", "termination": True, "simnorm_dim": 4}
-    options |= {"bin_min": -2.0, "bin_max": 3.0, "num_bins": 11, "log_std_min": -1.0, "log_std_max": 2.0}
-    model = build_world_model(tiny_config(model=options).model, OBSERVATION_DIM, ACTION_DIM)
-    assert len(model.encoder.hidden) == 2
-    assert model.value_head.hidden[0].dropout == 0.25
-    assert model.encoder.hidden[0].activation is torch.nn.functional.relu
-    assert model.termination_head is not None
-    latent = model.encode(torch.randn(OBSERVATION_DIM))
-    assert latent.sum().item() == pytest.approx(16 / 4)  # every group of SimNorm sums to one
-    torch.testing.assert_close(model.bins, torch.linspace(-2, 3, 11))
-    assert model.policy.log_std_bounds == (-1, 2)
-
-
-def test_every_setting_of_the_planner_arrives():
-    values = {"horizon": 4, "num_samples": 20, "num_elites": 5, "num_proposals": 3, "iterations": 7}
-    values |= {"inverse_temperature": 0.7, "std_min": 0.1, "std_max": 1.5}
-    values |= {"first_action": "mean", "eval_first_action": "elite"}
-    config = PlannerConfig(**values, score="final", beta=2.0)
-    world_model = build_world_model(tiny_config().model, OBSERVATION_DIM, ACTION_DIM)
-    planner = build_planner(world_model, config, discount=0.9, warm_start=True)
-    assert {name: getattr(planner, name) for name in values} == values
-    assert planner.score == FinalScore(beta=2.0)
-    assert planner.discount == 0.9
-
-
-def test_the_paper_s_planners_are_built_from_its_preset():
-    config = dataclasses.replace(preset("efficient-tdmpc-utd4"), compile="off", model=tiny_config().model)
-    agent = build_agent(config, OBSERVATION_DIM, ACTION_DIM)
-    for planner in (agent.planner, agent.eval_planner):
-        assert (planner.horizon, planner.num_samples, planner.num_elites, planner.num_proposals) == (6, 512, 64, 24)
-        assert planner.score == MeanScore(beta=0.0)
-    planner = agent.reanalyze_planner
-    assert (planner.horizon, planner.num_samples, planner.num_elites, planner.num_proposals) == (3, 64, 8, 3)
-    assert planner.score == FinalScore(beta=0.0)
-
-
-def test_the_discount_follows_from_the_episode_s_length_unless_it_is_given():
-    for agent, expected in ((tiny_agent(), 0.99), (tiny_agent(loss={"discount": 0.9}), 0.9)):
-        assert agent.loss.discount.item() == pytest.approx(expected)
-        assert [getattr(agent, name).discount for name in PLANNERS] == pytest.approx([expected] * 3)
-
-
-def test_the_loss_and_the_updater_take_their_settings():
-    loss = {"consistency_coef": 1.0, "reward_coef": 2.0, "value_coef": 3.0, "entropy_coef": 4.0, "rho": 0.25}
-    loss |= {"termination_coef": 5.0}
-    agent = tiny_agent(
-        model={"termination": True},
-        loss={**loss, "kl_direction": "forward", "tau": 0.125},
-        optim={"lr": 0.5, "encoder_lr_scale": 0.25, "grad_clip_norm": 7.0},
-    )
-    assert {name: getattr(agent.loss, name).item() for name in loss} == loss
-    assert (agent.loss.kl_direction, agent.loss.scale_tau) == ("forward", 0.125)
-    assert agent.updater.tau == 0.125
-    assert agent.updater.grad_clip_norm == 7
-    assert [group["lr"] for group in agent.updater.optimizer.param_groups] == [0.125, 0.5, 0.5]
-
-
-def test_loss_and_planners_share_one_world_model():
-    agent = tiny_agent(optim={"lr": 0.1})
-    assert all(getattr(agent, name).world_model is agent.world_model for name in PLANNERS)
-    assert agent.loss.world_model is agent.world_model
-    observation = torch.randn(4, OBSERVATION_DIM)
-    noise = {name: getattr(agent, name).draw_noise(4) for name in PLANNERS}
-    plan = {name: getattr(agent, name).plan(observation, noise=noise[name]) for name in PLANNERS}
-    again = {name: getattr(agent, name).plan(observation, noise=noise[name]) for name in PLANNERS}
-    agent.updater.step(random_slices(OBSERVATION_DIM, ACTION_DIM))
-    for name in PLANNERS:
-        after = getattr(agent, name).plan(observation, noise=noise[name])
-        assert torch.equal(plan[name].mean, again[name].mean)
-        assert not torch.equal(plan[name].mean, after.mean), f"the {name} did not see the update"
-
-
-def test_acting_planners_start_warm_and_reanalyze_starts_cold_with_widened_bounds():
-    agent = tiny_agent()
-    for planner in (agent.planner, agent.eval_planner):
-        assert planner.warm_start
-        assert "plan_mean" in planner.in_keys
-        assert planner.proposal_log_std_bounds is None
-    assert not agent.reanalyze_planner.warm_start
-    assert agent.reanalyze_planner.in_keys == ["observation"]
-    assert agent.reanalyze_planner.proposal_log_std_bounds == (-2, 1)
-    other = tiny_agent(reanalyze={"proposal_log_std_min": -1.5, "proposal_log_std_max": 0.5})
-    assert other.reanalyze_planner.proposal_log_std_bounds == (-1.5, 0.5)
-
-
-def test_the_two_acting_planners_are_apart_so_that_an_evaluation_disturbs_nothing():
-    agent = tiny_agent()
-    assert agent.planner is not agent.eval_planner
-
-
-@pytest.mark.parametrize(("action_dim", "extra"), [(20, 0), (21, 2)])
-def test_more_than_20_action_dimensions_add_iterations_to_acting_and_to_reanalyze(action_dim, extra):
-    agent = tiny_agent(action_dim, planner={"iterations": 3}, reanalyze={"iterations": 4})
-    assert agent.planner.iterations == agent.eval_planner.iterations == 3 + extra
-    assert agent.reanalyze_planner.iterations == 4 + extra
 
 
 @pytest.mark.parametrize(
@@ -186,7 +26,7 @@ def test_more_than_20_action_dimensions_add_iterations_to_acting_and_to_reanalyz
         ({"total_env_steps": 4_000_000}, 1_000_000),
     ],
 )
-def test_the_buffer_holds_the_budget_and_no_more_than_its_capacity(changes, capacity):
+def test_the_buffer_holds_the_budget_and_no_more_than_its_capacity(changes, capacity, tiny_config):
     config = tiny_config(**changes)
     size = build_replay(config).storage.max_size
     allowance = config.num_envs if capacity < config.replay.capacity else 0
@@ -204,18 +44,18 @@ def test_the_buffer_holds_the_budget_and_no_more_than_its_capacity(changes, capa
         ("run", "cpu", 10**12, "cpu"),
     ],
 )
-def test_the_buffer_is_on_the_run_s_device_if_it_fits(monkeypatch, setting, device, needed, expected):
+def test_the_buffer_is_on_the_run_s_device_if_it_fits(monkeypatch, setting, device, needed, expected, tiny_config):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda which: (100, 1000) if which.index == 1 else (0, 1000))
     config = tiny_config(replay={"device": setting})
     assert replay_device(config, device, needed) == torch.device(expected)
 
 
-def test_a_row_has_the_bytes_that_the_rule_counts_with():
+def test_a_row_has_the_bytes_that_the_rule_counts_with(tiny_config):
     pytest.importorskip("dm_control")
-    from torchrl_etdmpc.envs import make_dmc_env
+    from torchrl_etdmpc.envs import make_env
 
     config = tiny_config(task="walker-walk")
-    env = make_dmc_env("walker-walk", seed=0)
+    env = make_env("walker-walk", seed=0)
     replay = build_replay(config, sizes=(24, 6))
     collector = build_collector(config, build_agent(config, 24, 6), env, replay)
     for _ in range(3):
@@ -224,7 +64,7 @@ def test_a_row_has_the_bytes_that_the_rule_counts_with():
     assert replay[:].bytes() / 3 == row_bytes(24, 6) - generation
 
 
-def test_a_sample_is_a_batch_of_slices():
+def test_a_sample_is_a_batch_of_slices(tiny_config):
     config = tiny_config(optim={"batch_size": 5}, loss={"slice_len": 4}, replay={"uniform_over": "starts"})
     replay = build_replay(config)
     steps = torch.arange(30)
@@ -238,7 +78,7 @@ def test_a_sample_is_a_batch_of_slices():
 
 
 @pytest.mark.parametrize(("updates", "every", "interval"), [(1, 10, 10), (2, 5, 10), (4, 2, 8)])
-def test_the_reanalyze_interval_counts_decisions(updates, every, interval):
+def test_the_reanalyze_interval_counts_decisions(updates, every, interval, tiny_config):
     # Reanalyze counts samples, and there is one per update.
     config = tiny_config(optim={"updates_per_decision": updates}, reanalyze={"every": every, "num_slices": 7})
     agent, replay = build_agent(config, OBSERVATION_DIM, ACTION_DIM), build_replay(config)
@@ -248,9 +88,9 @@ def test_the_reanalyze_interval_counts_decisions(updates, every, interval):
     assert reanalyze.replay_buffer is replay
 
 
-def test_reanalyze_can_be_turned_off():
+def test_reanalyze_can_be_turned_off(tiny_config):
     config = tiny_config(reanalyze={"every": 0})
-    assert build_reanalyze(config, tiny_agent(), build_replay(config)) is None
+    assert build_reanalyze(config, build_agent(config, OBSERVATION_DIM, ACTION_DIM), build_replay(config)) is None
 
 
 def test_auto_is_the_cuda_device_where_there_is_one(monkeypatch):
@@ -269,46 +109,3 @@ def test_cuda_without_a_device_is_refused(monkeypatch, name):
         resolve_device(name)
     expected = f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
     assert str(caught.value) == expected
-
-
-def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compiled):
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.warns(UserWarning) as caught:
-        tiny_agent(compile="auto")
-    assert [str(warning.message) for warning in caught] == [
-        "no C++ compiler found, so nothing is compiled and training is slower; install g++."
-    ]
-    assert compiled == []
-
-
-def test_the_update_and_every_planner_are_compiled_and_nothing_else(compiled):
-    agent = tiny_agent(compile="default")
-    owners = [function.__wrapped__.__self__ for function, _ in compiled]
-    assert owners == [agent.updater, agent.planner, agent.eval_planner, agent.reanalyze_planner]
-    assert [function.__name__ for function, _ in compiled] == ["_gradients", "plan", "plan", "plan"]
-    assert all(options == COMPILE_OPTIONS for _, options in compiled)
-
-
-def test_nothing_is_compiled_if_it_is_turned_off(compiled):
-    tiny_agent(compile="off")
-    assert compiled == []
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler")
-def test_a_compiled_agent_plans_like_an_eager_one():
-    eager, fast = tiny_agent(compile="off"), tiny_agent(compile="default")
-    fast.world_model.load_state_dict(eager.world_model.state_dict())
-    for name, states in (("planner", 1), ("reanalyze_planner", 12)):
-        reference, planner = getattr(eager, name), getattr(fast, name)
-        observation, noise = torch.randn(states, OBSERVATION_DIM), reference.draw_noise(states)
-        expected, actual = (p.plan(observation, noise=noise) for p in (reference, planner))
-        for field in ("action", "loc", "scale", "value", "mean"):
-            torch.testing.assert_close(getattr(actual, field), getattr(expected, field), rtol=1e-3, atol=1e-4)
-        written = planner(TensorDict({"observation": observation, "is_init": torch.ones(states, 1).bool()}, [states]))
-        assert written["action"].isfinite().all()
-
-
-def test_the_settings_of_reanalyze_extend_those_of_a_planner():
-    names = {field.name for field in dataclasses.fields(PlannerConfig)}
-    assert names < {field.name for field in dataclasses.fields(ReanalyzeConfig)}

@@ -6,38 +6,19 @@ import itertools
 import shutil
 import sys
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.envs import make_dmc_env  # noqa: E402
 from torchrl_etdmpc.testing import random_slices  # noqa: E402
-from torchrl_etdmpc.training import RunLog, TrainConfig, TrainingRun, build_agent, preset  # noqa: E402
+from torchrl_etdmpc.training import build_agent  # noqa: E402
 from torchrl_etdmpc.training.compilation import compile_call, resolve_compile  # noqa: E402
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler"
 )
-
-
-def tiny_config(**changes) -> TrainConfig:
-    values = preset("cpu").to_dict() | {"task": "cartpole-balance", "total_env_steps": 120, "eval_episodes": 1}
-    values["model"] |= {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16}
-    values["planner"] |= {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 2}
-    values["reanalyze"] |= {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "num_slices": 2}
-    values["optim"] |= {"batch_size": 4}
-    values["replay"] |= {"seed_decisions": 50, "pretrain_updates": 3}
-    return TrainConfig.from_dict(values | changes)
-
-
-def make_run(config: TrainConfig, run_dir: Path) -> TrainingRun:
-    torch.manual_seed(0)
-    env, eval_env = (make_dmc_env(config.task, seed=seed) for seed in (0, 1))
-    log = RunLog.create(run_dir, config=config.to_dict(), total_env_steps=config.total_env_steps)
-    return TrainingRun(config, env=env, eval_env=eval_env, log=log)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +71,7 @@ def test_one_process_compiles_as_many_agents_as_it_likes():
         assert [call(torch.zeros(1)).item() for call in calls] == [0, 1, 2, 3]
 
 
-def test_a_run_that_cannot_compile_goes_on_without_and_says_so_once(tmp_path, monkeypatch):
+def test_a_run_that_cannot_compile_goes_on_without_and_says_so_once(tmp_path, monkeypatch, tiny_config, make_run):
     def broken(function, **options):
         def call(*args, **kwargs):
             raise RuntimeError("no such file: omp.h\nand a long log")
@@ -99,16 +80,16 @@ def test_a_run_that_cannot_compile_goes_on_without_and_says_so_once(tmp_path, mo
 
     monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/g++")
     monkeypatch.setattr(torch, "compile", broken)
-    run = make_run(tiny_config(), tmp_path)
+    run = make_run(tiny_config(compile="auto", total_env_steps=80, checkpoint_every=1000), tmp_path)
     with pytest.warns(
         UserWarning, match=r"^cannot compile here, so training is slower: no such file: omp.h$"
     ) as caught:
         run.run()
     assert len(caught) == 1
-    assert run.agent.updater.updates == 3 + 10
+    assert run.learner.agent.updater.updates == 7 + 2 * 10
 
 
-def test_a_run_that_must_compile_and_cannot_stops(tmp_path, monkeypatch):
+def test_a_run_that_must_compile_and_cannot_stops(tmp_path, monkeypatch, tiny_config, make_run):
     def broken(function, **options):
         raise RuntimeError("no compiler")
 
@@ -118,15 +99,16 @@ def test_a_run_that_must_compile_and_cannot_stops(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def warmed(tmp_path_factory):
+def warmed(tmp_path_factory, tiny_config, make_run):
     """A run of small networks that was warmed up, and what it was before."""
     run = make_run(tiny_config(compile="default"), tmp_path_factory.mktemp("runs") / "run")
-    before = copy.deepcopy(run.agent.loss.state_dict()), torch.get_rng_state()
+    before = copy.deepcopy(run.learner.agent.loss.state_dict()), torch.get_rng_state()
     torch._dynamo.utils.counters.clear()
-    run.warm_up()
-    yield run, before, (copy.deepcopy(run.agent.loss.state_dict()), torch.get_rng_state())
-    run.collector.shutdown()
-    run.eval_env.close()
+    run.precompile()
+    yield run, before, (copy.deepcopy(run.learner.agent.loss.state_dict()), torch.get_rng_state())
+    run.learner.collector.shutdown()
+    run.evaluator.close()
+    run.log.directory.close()
 
 
 @needs_compiler
@@ -134,9 +116,9 @@ def test_warming_up_moves_neither_weights_nor_the_running_scale_nor_random_numbe
     run, (weights, state), (weights_after, state_after) = warmed
     assert torch.equal(state, state_after)
     assert all(torch.equal(value, weights_after[name]) for name, value in weights.items())
-    assert run.agent.updater.updates == 0
-    assert run.agent.loss.distill
-    assert len(run.replay) == 0
+    assert run.learner.agent.updater.updates == 0
+    assert run.learner.agent.loss.distill
+    assert len(run.learner.replay) == 0
 
 
 @needs_compiler
@@ -146,18 +128,18 @@ def test_a_run_that_was_warmed_up_compiles_nothing_more(warmed):
     assert graphs == 4  # acting, evaluation, reanalyze and the gradients: one graph each
     assert not torch._dynamo.utils.counters["graph_break"]
     for _ in range(50):
-        run.step()
-    run.pretrain()
-    for _ in range(2 * run.reanalyze.interval):
-        run.step()
-        run.update()
-    assert run.reanalyze.refreshed > 0
+        run.learner.step()
+    list(run.learner.pretrain())
+    for _ in range(2 * run.learner.reanalyze.interval):
+        run.learner.step()
+        run.learner.update()
+    assert run.learner.reanalyze.refreshed > 0
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == graphs
 
 
 @needs_compiler
 def test_compiled_updates_leave_no_memory_behind(warmed):
-    updater, batch = warmed[0].agent.updater, random_slices(5, 1, num_slices=4)
+    updater, batch = warmed[0].learner.agent.updater, random_slices(5, 1, num_slices=4).contiguous()
 
     counts = []
     for _ in range(6):
@@ -170,26 +152,31 @@ def test_compiled_updates_leave_no_memory_behind(warmed):
 
 
 @needs_compiler
-def test_a_compiled_update_equals_an_eager_one(warmed):
-    agent = warmed[0].agent
-    eager = build_agent(tiny_config(compile="off"), 5, 1)
+def test_a_compiled_update_equals_an_eager_one(warmed, tiny_config):
+    agent = warmed[0].learner.agent
+    eager = build_agent(tiny_config(), 5, 1)
     eager.loss.load_state_dict(agent.loss.state_dict())
-    batch = random_slices(5, 1, num_slices=4)
-    inputs = [(loss.slices(batch), loss.target_values()) for loss in (agent.loss, eager.loss)]
-    torch.manual_seed(1)
-    metrics, gradients, skip = eager.updater._gradients(*inputs[1])
-    torch.manual_seed(1)
-    compiled = compile_call(agent.updater._gradients, "default")
-    with torch._dynamo.config.patch(trace_autograd_ops=True), torch._inductor.config.patch(fallback_random=True):
-        fast_metrics, fast_gradients, fast_skip = compiled(*inputs[0])
-    torch.testing.assert_close(fast_metrics, metrics, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(fast_gradients, gradients, rtol=1e-3, atol=1e-5)
-    assert skip == fast_skip == 0
+    batch = random_slices(5, 1, num_slices=4).contiguous()
+    metrics, gradients = [], []
+    for updater in (eager.updater, agent.updater):
+        applied = []
+
+        def record(optimizer, *_, applied=applied):
+            applied += [flat.grad.clone() for group in optimizer.param_groups for flat in group["params"]]
+
+        hook = updater.optimizer.register_step_pre_hook(record)
+        torch.manual_seed(1)
+        metrics.append(updater.step(batch).to_dict())
+        hook.remove()
+        gradients.append(applied)
+    assert len(gradients[0]) == 4
+    torch.testing.assert_close(metrics[1], metrics[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-5)
 
 
 @needs_compiler
 def test_compiled_calls_draw_the_random_numbers_of_eager_ones(warmed):
-    planner = warmed[0].agent.planner
+    planner = warmed[0].learner.agent.planner
     draws = []
     for call in (compile_call(planner.draw_noise, "default"), planner.draw_noise):
         torch.manual_seed(3)

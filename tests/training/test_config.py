@@ -1,12 +1,31 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import typing
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
 import yaml
 
-from torchrl_etdmpc.training import PRESETS, TrainConfig, preset
+from torchrl_etdmpc import (
+    EfficientTDMPCLoss,
+    EnsembleMPPIPlanner,
+    ReanalyzeTransform,
+    StepCollector,
+    StepSliceSampler,
+    WorldModel,
+)
+from torchrl_etdmpc.training import (
+    PRESETS,
+    TrainConfig,
+    Updater,
+    build_agent,
+    build_reanalyze,
+    build_replay,
+    preset,
+)
 from torchrl_etdmpc.training.config import (
     LossConfig,
     ModelConfig,
@@ -41,7 +60,7 @@ UTD4 = {
     "model.log_std_min": -3.0,
     "model.log_std_max": 1.0,
     "model.activation": "mish",
-    "model.termination": False,
+    "model.termination": None,  # DMC never terminates
     "planner.horizon": 6,
     "planner.score": "mean",
     "planner.beta": 0.0,
@@ -56,7 +75,7 @@ UTD4 = {
     "planner.std_max": 2.0,
     "planner.first_action": "elite",
     "planner.eval_first_action": "best",
-    "planner.scoring_dtype": "float32",
+    "planner.scoring_dtype": None,
     "reanalyze.horizon": 3,
     "reanalyze.score": "final",
     "reanalyze.beta": 0.0,  # on DMC
@@ -71,7 +90,7 @@ UTD4 = {
     "reanalyze.std_max": 2.0,
     "reanalyze.first_action": "elite",
     "reanalyze.eval_first_action": "best",
-    "reanalyze.scoring_dtype": "float32",
+    "reanalyze.scoring_dtype": None,
     "reanalyze.every": 2,
     "reanalyze.num_slices": 20,
     "reanalyze.proposal_log_std_min": -2.0,
@@ -152,12 +171,12 @@ def test_every_preset_is_known_by_its_own_name():
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_the_seed_phase_and_the_pretraining_are_five_episodes_on_dmc(name):
+def test_the_random_phase_and_the_pretraining_are_five_episodes_on_dmc(name):
     assert preset(name).seed_decisions == 2500
     assert preset(name).pretrain_updates == 2500
 
 
-def test_the_pretraining_follows_the_seed_phase_unless_it_is_given():
+def test_the_pretraining_follows_the_random_phase_unless_it_is_given():
     assert TrainConfig.from_dict(overrides(replay__seed_decisions=700)).pretrain_updates == 700
     both = TrainConfig.from_dict(overrides(replay__seed_decisions=700, replay__pretrain_updates=0))
     assert (both.seed_decisions, both.pretrain_updates) == (700, 0)
@@ -227,6 +246,8 @@ def test_no_setting_can_be_changed_afterwards(cls):
         ({"loss": {"discount": None}}, "loss.discount", None),
         ({"replay": {"seed_decisions": 3e3}}, "replay.seed_decisions", 3000),
         ({"compile": False}, "compile", "off"),  # YAML reads a bare off as a boolean
+        ({"planner": {"scoring_dtype": "bfloat16"}}, "planner.scoring_dtype", "bfloat16"),
+        ({"planner": {"scoring_dtype": None}}, "planner.scoring_dtype", None),
     ],
 )
 def test_a_number_or_switch_may_be_written_in_its_natural_way(written, name, meant):
@@ -246,7 +267,7 @@ def test_a_number_or_switch_may_be_written_in_its_natural_way(written, name, mea
         ({"eval_policy": 1}, "eval_policy must be of type bool, got 1."),
         ({"task": None}, "task must be of type str, got None."),
         ({"run_dir": 7}, "run_dir must be of type str, got 7."),
-        ({"resume": 1}, "resume must be of type str, got 1."),
+        ({"run_dir": True}, "run_dir must be of type str, got True."),
         ({"planner": 3}, "planner must be a group of settings, got 3."),
         ({"optim__lr": "fast"}, "optim.lr must be of type float, got 'fast'."),
         ({"optim__lr": True}, "optim.lr must be of type float, got True."),
@@ -275,76 +296,24 @@ def test_an_unknown_setting_is_refused_with_the_known_ones(settings, name, known
     assert "\n" not in message
 
 
-REFUSED = [
-    # sizes of the networks
-    ({"model__latent_dim": 20}, "model.latent_dim must be a multiple of model.simnorm_dim=8, got 20."),
-    ({"model__simnorm_dim": 7}, "model.latent_dim must be a multiple of model.simnorm_dim=7, got 512."),
-    *(
-        ({f"model__{name}": 0}, f"model.{name} must be at least 1, got 0.")
-        for name in (
-            "latent_dim",
-            "mlp_dim",
-            "encoder_dim",
-            "encoder_layers",
-            "num_dynamics",
-            "num_values",
-            "simnorm_dim",
-        )
-    ),
-    ({"model__num_bins": 1}, "model.num_bins must be at least 2, got 1."),
-    ({"model__bin_min": 10.0}, "model.bin_min must be below model.bin_max."),
-    ({"model__log_std_min": 1.0}, "model.log_std_min must be below model.log_std_max."),
-    ({"model__dropout": 1.0}, "model.dropout must be in [0, 1), got 1.0."),
+# Types, choices, and what concerns several parts: refused before anything is built.
+REFUSED_AT_ONCE = [
     ({"model__activation": "tanh"}, "model.activation must be one of mish, silu, relu, got 'tanh'."),
-    # both planners
-    ({"planner__num_elites": 600}, "planner.num_elites must be at most planner.num_samples=512, got 600."),
-    ({"reanalyze__num_elites": 65}, "reanalyze.num_elites must be at most reanalyze.num_samples=64, got 65."),
-    *(
-        ({f"{group}__{name}": 0}, f"{group}.{name} must be at least 1, got 0.")
-        for group in ("planner", "reanalyze")
-        for name in ("horizon", "iterations", "num_elites")
-    ),
-    ({"planner__num_proposals": 512}, "planner.num_proposals must be in [0, 512), got 512."),
-    ({"reanalyze__num_proposals": -1}, "reanalyze.num_proposals must be in [0, 64), got -1."),
-    ({"planner__extra_iterations": -1}, "planner.extra_iterations must not be negative, got -1."),
-    ({"planner__inverse_temperature": -0.5}, "planner.inverse_temperature must not be negative, got -0.5."),
-    ({"planner__std_min": 0.0}, "planner.std_min must be in (0, planner.std_max=2.0], got 0.0."),
-    ({"reanalyze__std_min": 3.0}, "reanalyze.std_min must be in (0, reanalyze.std_max=2.0], got 3.0."),
     ({"planner__score": "median"}, "planner.score must be one of final, mean, adaptive, got 'median'."),
-    (
-        {"planner__score": "adaptive", "planner__beta": -1.0},
-        "planner.beta must not be negative with planner.score=adaptive, got -1.0.",
-    ),
     ({"planner__first_action": "worst"}, "planner.first_action must be one of elite, mean, best, got 'worst'."),
     (
-        {"planner__scoring_dtype": "float16"},
-        "planner.scoring_dtype must be one of float32, bfloat16, got 'float16'.",
+        {"planner__scoring_dtype": "int8"},
+        "planner.scoring_dtype must be one of float16, bfloat16, float32, float64, got 'int8'.",
     ),
     (
         {"reanalyze__eval_first_action": "any"},
         "reanalyze.eval_first_action must be one of elite, mean, best, got 'any'.",
     ),
-    ({"reanalyze__every": -1}, "reanalyze.every must not be negative, got -1; 0 turns reanalyze off."),
-    ({"reanalyze__num_slices": 0}, "reanalyze.num_slices must be at least 1, got 0."),
-    (
-        {"reanalyze__proposal_log_std_min": 2.0},
-        "reanalyze.proposal_log_std_min must be below reanalyze.proposal_log_std_max.",
-    ),
-    # learning
-    ({"loss__slice_len": 0}, "loss.slice_len must be at least 1, got 0."),
+    ({"reanalyze__every": -1}, "reanalyze.every must not be negative, got -1."),
     ({"loss__slice_len": 501}, "loss.slice_len must fit into an episode of 500 decisions, got 501."),
-    ({"loss__rho": 0.0}, "loss.rho must be in (0, 1], got 0.0."),
-    ({"loss__tau": 1.5}, "loss.tau must be in [0, 1], got 1.5."),
-    ({"loss__discount": 1.01}, "loss.discount must be in (0, 1], got 1.01."),
-    ({"loss__discount": 0.0}, "loss.discount must be in (0, 1], got 0.0."),
     ({"loss__kl_direction": "both"}, "loss.kl_direction must be one of backward, forward, got 'both'."),
     ({"optim__batch_size": 0}, "optim.batch_size must be at least 1, got 0."),
     ({"optim__updates_per_decision": 0}, "optim.updates_per_decision must be at least 1, got 0."),
-    ({"optim__lr": 0.0}, "optim.lr must be positive, got 0.0."),
-    ({"optim__lr": float("nan")}, "optim.lr must be positive, got nan."),
-    ({"optim__grad_clip_norm": 0.0}, "optim.grad_clip_norm must be positive, got 0.0."),
-    ({"optim__encoder_lr_scale": -0.3}, "optim.encoder_lr_scale must not be negative, got -0.3."),
-    # data
     ({"replay__capacity": 0}, "replay.capacity must be at least 1, got 0."),
     ({"replay__capacity": 5}, "replay.capacity must be at least 6 with these settings, got 5."),
     ({"replay__capacity": 11, "num_envs": 2}, "replay.capacity must be at least 12 with these settings, got 11."),
@@ -365,10 +334,9 @@ REFUSED = [
         "replay.seed_decisions must cover an episode of every environment (1000 decisions) with "
         "replay.insertion=episode, got 999.",
     ),
-    # the run
     (
         {"total_env_steps": 5000},
-        "total_env_steps must exceed the seed phase of 5000 env steps, got 5000; raise the budget or lower "
+        "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise the budget or lower "
         "replay.seed_decisions.",
     ),
     *(
@@ -385,17 +353,105 @@ REFUSED = [
             "max_skipped",
         )
     ),
+    *(
+        ({name: 0}, f"{name} of task 'walker-walk' must be at least 1, got 0.")
+        for name in ("action_repeat", "episode_length")
+    ),
     ({"resume": "yes"}, "resume must be one of off, on, auto, got 'yes'."),
+    ({"resume": 1}, "resume must be one of off, on, auto, got 1."),
     ({"checkpoint_minutes": 0.0}, "checkpoint_minutes must be positive or null, got 0.0."),
-    ({"device": "tpu"}, "device must be one of auto, cpu, cuda, got 'tpu'."),
+    ({"device": "tpu"}, "device must be one of auto, cpu, cuda, cuda:N, got 'tpu'."),
     ({"compile": "most"}, "compile must be one of auto, off, default, max, got 'most'."),
     ({"logger": "mlflow"}, "logger must be one of none, tensorboard, wandb, got 'mlflow'."),
 ]
 
+# The range of one part's argument: refused by its class, when the parts are built.
+REFUSED_BY_A_PART = [
+    (
+        {"model__latent_dim": 20},
+        "model.latent_dim must be a multiple of simnorm_dim=8, got 20; the nearest is 16.",
+    ),
+    (
+        {"model__simnorm_dim": 7},
+        "model.latent_dim must be a multiple of simnorm_dim=7, got 512; the nearest is 511.",
+    ),
+    *(
+        ({f"model__{name}": 0}, f"model.{name} must be at least 1, got 0.")
+        for name in (
+            "latent_dim",
+            "mlp_dim",
+            "encoder_dim",
+            "encoder_layers",
+            "num_dynamics",
+            "num_values",
+            "simnorm_dim",
+        )
+    ),
+    ({"model__num_bins": 1}, "model.num_bins must be at least 2, got 1."),
+    ({"model__bin_min": 10.0}, "model.bin_min must be below bin_max=10.0, got 10.0."),
+    ({"model__log_std_min": 1.0}, "model.log_std_min must be below log_std_max=1.0, got 1.0."),
+    ({"model__dropout": 1.0}, "model.dropout must be in [0, 1), got 1.0."),
+    ({"planner__num_elites": 600}, "planner.num_elites must be at most num_samples=512, got 600."),
+    ({"reanalyze__num_elites": 65}, "reanalyze.num_elites must be at most num_samples=64, got 65."),
+    *(
+        ({f"{group}__{name}": 0}, f"{group}.{name} must be at least 1, got 0.")
+        for group in ("planner", "reanalyze")
+        for name in ("horizon", "iterations", "num_elites")
+    ),
+    ({"planner__num_proposals": 512}, "planner.num_proposals must be in [0, num_samples=512), got 512."),
+    ({"reanalyze__num_proposals": -1}, "reanalyze.num_proposals must be in [0, num_samples=64), got -1."),
+    ({"planner__extra_iterations": -1}, "planner.extra_iterations must not be negative, got -1."),
+    ({"planner__inverse_temperature": -0.5}, "planner.inverse_temperature must not be negative, got -0.5."),
+    ({"planner__std_min": 0.0}, "planner.std_min must be in (0, std_max=2.0], got 0.0."),
+    ({"reanalyze__std_min": 3.0}, "reanalyze.std_min must be in (0, std_max=2.0], got 3.0."),
+    (
+        {"planner__score": "adaptive", "planner__beta": -1.0},
+        "planner.beta must not be negative with the adaptive score, got -1.0; score='final' and score='mean' take a "
+        "negative one, for optimism.",
+    ),
+    ({"reanalyze__num_slices": 0}, "reanalyze.num_slices must be at least 1, got 0."),
+    (
+        {"reanalyze__proposal_log_std_min": 2.0},
+        "reanalyze.proposal_log_std_min must be below proposal_log_std_max=1.0, got 2.0.",
+    ),
+    (
+        {"reanalyze__proposal_log_std_min": None},
+        "reanalyze.proposal_log_std_min and proposal_log_std_max must be given together, got None and 1.0; leave both "
+        "out for the policy's own bounds.",
+    ),
+    ({"loss__slice_len": 0}, "loss.slice_len must be at least 1, got 0."),
+    ({"loss__rho": 0.0}, "loss.rho must be in (0, 1], got 0.0."),
+    ({"loss__tau": 1.5}, "loss.tau must be in [0, 1], got 1.5."),
+    ({"loss__discount": 1.01}, "loss.discount must be in (0, 1], got 1.01; see discount_from_episode_length."),
+    ({"loss__discount": 0.0}, "loss.discount must be in (0, 1], got 0.0; see discount_from_episode_length."),
+    ({"optim__lr": 0.0}, "optim.lr must be positive, got 0.0."),
+    ({"optim__lr": float("nan")}, "optim.lr must be positive, got nan."),
+    ({"optim__grad_clip_norm": 0.0}, "optim.grad_clip_norm must be positive, got 0.0."),
+    ({"optim__encoder_lr_scale": -0.3}, "optim.encoder_lr_scale must not be negative, got -0.3."),
+]
 
-@pytest.mark.parametrize(("settings", "message"), REFUSED, ids=[", ".join(settings) for settings, _ in REFUSED])
+
+def named(cases: list[tuple[dict[str, Any], str]]) -> Any:
+    return pytest.mark.parametrize(("settings", "message"), cases, ids=[", ".join(settings) for settings, _ in cases])
+
+
+@named(REFUSED_AT_ONCE)
 def test_an_impossible_setting_is_refused_in_one_line_that_names_it(settings, message):
     assert refusal(**settings) == message
+
+
+@named(REFUSED_BY_A_PART)
+def test_a_setting_that_a_part_refuses_is_named_as_the_command_line_names_it(settings, message):
+    config = TrainConfig.from_dict(overrides(**settings) | {"compile": "off"})
+    with pytest.raises(ValueError) as caught:
+        build(config)
+    assert str(caught.value) == message
+
+
+def build(config: TrainConfig) -> None:
+    """Everything that has settings."""
+    agent = build_agent(config, 3, 1)
+    build_reanalyze(config, agent, build_replay(config))
 
 
 @pytest.mark.parametrize(
@@ -415,7 +471,9 @@ def test_an_impossible_setting_is_refused_in_one_line_that_names_it(settings, me
     ],
 )
 def test_the_last_possible_value_is_accepted(settings):
-    config = TrainConfig.from_dict(overrides(**settings)).to_dict()
+    config = TrainConfig.from_dict(overrides(**settings) | {"compile": "off"})
+    build(config)
+    config = config.to_dict()
     for name, value in settings.items():
         *group, last = name.split("__")
         assert (config[group[0]] if group else config)[last] == value
@@ -433,7 +491,96 @@ def test_an_unknown_task_is_refused_with_the_nearest_names():
 
 
 def test_a_configuration_cannot_be_made_impossible_by_replacing_a_value():
-    with pytest.raises(ValueError, match=r"^planner\.num_elites must be at most"):
-        dataclasses.replace(preset("cpu").planner, num_elites=49)
-    with pytest.raises(ValueError, match="^total_env_steps must exceed the seed phase"):
+    with pytest.raises(ValueError, match="^total_env_steps must exceed the random phase"):
         dataclasses.replace(preset("cpu"), total_env_steps=1000)
+    with pytest.raises(ValueError, match=r"^planner\.score must be one of"):
+        dataclasses.replace(preset("cpu"), planner=PlannerConfig(score="median"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"resume": False}, "resume must be 'off', got False."),
+        ({"compile": True}, "compile must be one of auto, off, default, max, got 'on'."),
+        ({"total_env_steps": 2e5}, "total_env_steps must be 200000, got 200000.0."),
+        ({"planner": PlannerConfig(horizon=6.0)}, "planner.horizon must be 6, got 6.0."),
+        ({"planner": {"horizon": 6}}, "planner must be a PlannerConfig, got {'horizon': 6}."),
+    ],
+)
+def test_only_a_dictionary_may_spell_a_value_otherwise(changes, message):
+    with pytest.raises(ValueError) as caught:
+        TrainConfig(**changes)
+    assert str(caught.value) == message
+
+
+def test_a_run_can_change_what_is_known_of_its_task():
+    config = TrainConfig(action_repeat=4, episode_length=802, terminates=True, total_env_steps=10_001)
+    task = config.task_spec
+    assert (task.name, task.action_repeat, task.episode_length, task.terminates) == ("walker-walk", 4, 802, True)
+    assert (config.seed_decisions, config.total_decisions) == (1005, 2501)
+    assert TrainConfig().task_spec == TrainConfig(action_repeat=2, episode_length=1000, terminates=False).task_spec
+
+
+def test_the_settings_of_a_task_may_be_what_makes_it_possible():
+    gymnasium = pytest.importorskip("gymnasium")
+    gymnasium.register("EndlessPendulum-v0", gymnasium.spec("Pendulum-v1").entry_point)
+    with pytest.raises(ValueError, match=r"task\.episode_length="):
+        TrainConfig(task="gym/EndlessPendulum-v0")
+    assert TrainConfig(task="gym/EndlessPendulum-v0", episode_length=300).seed_decisions == 1500
+
+
+# Each group's settings are the arguments of these classes.
+ARGUMENTS_OF = {
+    ModelConfig: (WorldModel,),
+    PlannerConfig: (EnsembleMPPIPlanner,),
+    ReanalyzeConfig: (EnsembleMPPIPlanner, ReanalyzeTransform),
+    LossConfig: (EfficientTDMPCLoss, StepSliceSampler, Updater),
+    OptimConfig: (Updater,),
+    ReplayConfig: (StepSliceSampler, StepCollector),
+}
+# Settings of the loop, which no class takes as they are.
+OF_THE_LOOP = {
+    ReanalyzeConfig: {"every"},
+    OptimConfig: {"batch_size", "updates_per_decision"},
+    ReplayConfig: {"capacity", "device", "seed_decisions", "pretrain_updates"},
+}
+# Arguments whose default is not the class'.
+OWN_DEFAULT = {
+    ModelConfig: {"termination"},  # follows from the task
+    ReanalyzeConfig: {  # a smaller budget than for acting, and BMPC's wider policy
+        *("horizon", "num_samples", "num_elites", "num_proposals", "score"),
+        *("proposal_log_std_min", "proposal_log_std_max"),
+    },
+    LossConfig: {"discount", "slice_len"},  # the classes have none
+}
+
+
+def choices(hint: Any) -> set[Any]:
+    """All values that the Literals in a type allow."""
+    if typing.get_origin(hint) is typing.Literal:
+        return set(typing.get_args(hint))
+    return set().union(*(choices(part) for part in typing.get_args(hint)))
+
+
+def arguments(cls: type) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(cls.__init__).parameters
+
+
+@pytest.mark.parametrize("group", ARGUMENTS_OF, ids=lambda group: group.__name__)
+def test_a_setting_and_the_argument_behind_it_have_one_name_one_default_and_the_same_choices(group):
+    differ, unknown = set(), set()
+    for field in dataclasses.fields(group):
+        owners = [cls for cls in ARGUMENTS_OF[group] if field.name in arguments(cls)]
+        if not owners:
+            unknown.add(field.name)
+        for cls in owners:
+            hint = typing.get_type_hints(cls.__init__)[field.name]
+            assert choices(typing.get_type_hints(group)[field.name]) == choices(hint), field.name
+            if arguments(cls)[field.name].default != field.default:
+                differ.add(field.name)
+    assert unknown == OF_THE_LOOP.get(group, set())
+    assert differ == OWN_DEFAULT.get(group, set())
+
+
+def test_the_running_scale_s_rate_is_that_of_the_targets():
+    assert arguments(EfficientTDMPCLoss)["scale_tau"].default == LossConfig().tau

@@ -3,16 +3,15 @@ from __future__ import annotations
 import csv
 import json
 import os
-import random
+import shutil
 import signal
 import subprocess
 import warnings
 from collections.abc import Callable
-from itertools import count, takewhile
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.utils._pytree import tree_map_only
@@ -30,7 +29,6 @@ from torchrl_etdmpc.training import (  # noqa: E402
     read_run_config,
     resumed_config,
 )
-
 
 SETTINGS: dict[str, Any] = {
     "task": "cartpole-swingup",
@@ -134,7 +132,7 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, st
     "changes",
     [
         {"num_envs": 3, "total_env_steps": 200},
-        {"replay": {"insertion": "episode", "seed_decisions": 500}, "total_env_steps": 1040, "eval_every": 1020},
+        {"replay": {"insertion": "episode"}, "episode_length": 40},
         {"replay": {"capacity": 30}},
         {"reanalyze": {"every": 0}},
         {"overlap": True},
@@ -183,7 +181,8 @@ def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path, small_config, mak
     short = small_config(total_env_steps=100)
     run = make_run(short, tmp_path)
     run.run()
-    longer = resumed_config(read_run_config(RunDirectory(tmp_path)), small_config(total_env_steps=140), ["total_env_steps"])
+    stored = read_run_config(RunDirectory(tmp_path))
+    longer = resumed_config(stored, small_config(total_env_steps=140), ["total_env_steps"])
     resumed = make_run(longer, tmp_path, resume=True)
     assert resumed.run()["env_steps"] == 140
     assert read_run_config(RunDirectory(tmp_path)).total_env_steps == 140
@@ -199,20 +198,34 @@ def test_other_settings_must_stay(tmp_path, small_config):
         resumed_config(saved, asked, ["planner.horizon"])
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, tiny_config, make_run) -> Path:
+    """The directory of a run that came to its end; tests damage a copy."""
+    run_dir = tmp_path_factory.mktemp("finished")
+    run = make_run(tiny_config(**SETTINGS), run_dir)
+    run.run()
+    run.log.directory.close()
+    return run_dir
+
+
+def rows_of_the_newest(checkpoints: Path) -> Path:
+    """A file of the buffer that only the newest checkpoint needs."""
+    before, after = (
+        json.loads((checkpoints / "resume" / f"{steps:012d}" / "manifest.json").read_text())["replay"]["rows"]
+        for steps in (100, 140)
+    )
+    return checkpoints / "replay" / next(entry["file"] for entry in after if entry not in before)
+
+
 @pytest.mark.parametrize("damaged", ["agent.pt", "collector.pt", "state.pt", "manifest.json", "replay"])
 @pytest.mark.parametrize("how", ["missing", "cut off", "a flipped bit"])
-def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(tmp_path, straight, damaged, how, small_config, make_run):
-    config = small_config()
-    make_run(config, tmp_path).run()
-    checkpoints = tmp_path / "checkpoints"
+def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(
+    tmp_path, finished, straight, damaged, how, small_config, make_run
+):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    checkpoints = run_dir / "checkpoints"
     newest = checkpoints / "resume" / f"{140:012d}"
-    if damaged == "replay":
-        before = json.loads((checkpoints / "resume" / f"{100:012d}" / "manifest.json").read_text())["replay"]
-        after = json.loads((newest / "manifest.json").read_text())["replay"]
-        names = [entry["file"] for entry in after["rows"] if entry not in before["rows"]]
-        file = checkpoints / "replay" / names[0]
-    else:
-        file = newest / damaged
+    file = rows_of_the_newest(checkpoints) if damaged == "replay" else newest / damaged
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 255
     {
@@ -220,12 +233,13 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(tmp_path, straig
         "cut off": lambda: file.write_bytes(data[: len(data) // 2]),
         "a flipped bit": lambda: file.write_bytes(data),
     }[how]()
-    (tmp_path / "summary.json").unlink()
     with pytest.warns(UserWarning, match=r"^going on from .*/000000000100, because "):
-        resumed = make_run(config, tmp_path, resume=True)
-    assert resumed.env_steps == 100
-    resumed.run()
-    assert results(resumed, tmp_path) == straight(config)
+        resumed = make_run(small_config(), run_dir, resume=True)
+    assert (resumed.env_steps, len(resumed.learner.replay)) == (100, 50)
+    if how == "cut off":  # to the end, once for every kind of file
+        (run_dir / "summary.json").unlink()
+        resumed.run()
+        assert results(resumed, run_dir) == straight(small_config())
 
 
 def test_without_any_checkpoint_the_error_says_so(tmp_path, small_config, make_run):
@@ -237,17 +251,115 @@ def test_without_any_checkpoint_the_error_says_so(tmp_path, small_config, make_r
         make_run(config, tmp_path, resume=True)
 
 
-def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(tmp_path, small_config, make_run):
-    config = small_config()
-    make_run(config, tmp_path).run()
-    for file in tmp_path.glob("checkpoints/resume/*/manifest.json"):
-        file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 1}))
+def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(
+    tmp_path, finished, small_config, make_run
+):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    for file in run_dir.glob("checkpoints/resume/*/manifest.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 2}))
     with pytest.raises(
-        CheckpointError, match=r"^cannot resume: .*/000000000140 has checkpoint format 1; this version r"
+        CheckpointError, match=r"^cannot resume: .*/000000000140 has checkpoint format 2; this version r"
     ):
-        make_run(config, tmp_path, resume=True)
-    _, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
+        make_run(small_config(), run_dir, resume=True)
+    _, _, counters = load_agent(run_dir / "checkpoints" / "last.pt")
     assert counters["env_steps"] == 140
+
+
+def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, make_run, read_table):
+    # The words are stored, so they outlive the code: no renaming may change what they mean.
+    config = small_config(checkpoint_every=1000)
+    run = make_run(config, tmp_path)
+    for _ in range(24):
+        run.learner.step()
+    list(run.learner.pretrain())
+    state = {
+        "stage": "learn",
+        "due": ["evaluation", "train_row", "checkpoint"],
+        "eval_returns": [1e6],
+        "best_saved": 1e6,
+        "learning_s": 2.0,
+        "wall_s": 3.0,
+    }
+    run.state.load_state_dict(state)
+    assert run.save()
+    run.log.directory.close()
+    resumed = make_run(config, tmp_path, resume=True)
+    restored = resumed.state.state_dict()
+    assert restored.pop("wall_s") >= state.pop("wall_s")
+    assert restored == state
+    done, save = [], resumed.store.save
+    resumed.store.save = lambda step, *args, **options: done.append(step) or save(step, *args, **options)
+    stop_at(resumed, resumed.learner.collector, "act", 1)
+    with pytest.raises(RunInterrupted):
+        resumed.run()
+    assert done == [48, 50]  # because it was due, and because it was asked to stop
+    assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [48]
+    assert [row["env_steps"] for row in read_table(tmp_path / "train.csv")] == [48]
+    assert resumed.state.stage == "learn"
+    assert resumed.state.due == []
+
+
+@pytest.mark.parametrize("stage", ["random", "pretrain", "learn"])
+def test_a_run_goes_on_in_the_stage_that_was_saved(tmp_path, stage, small_config, make_run):
+    config = small_config(total_env_steps=70, eval_every=1000)
+    run = make_run(config, tmp_path)
+    for _ in range(30 if stage == "learn" else 24):
+        run.learner.step()
+    run.state.load_state_dict(run.state.state_dict() | {"stage": stage, "due": []})
+    assert run.save()
+    run.log.directory.close()
+    resumed = make_run(config, tmp_path, resume=True)
+    resumed.run()
+    learned = resumed.learner.collector.frames - (30 if stage == "learn" else 24)
+    assert resumed.learner.agent.updater.updates == (0 if stage == "learn" else 7) + 2 * learned
+
+
+def test_an_evaluation_after_a_resume_plays_the_same_episodes(tmp_path, small_config, make_run):
+    run = make_run(small_config(), tmp_path)
+    for _ in range(5):
+        run.learner.step()
+    assert run.save()
+    before = run.evaluator()
+    run.log.directory.close()
+    resumed = make_run(small_config(), tmp_path, resume=True)
+    for _ in range(3):
+        resumed.learner.step()
+    assert resumed.evaluator() == run.evaluator() == before
+
+
+class Refusing:
+    """A part that cannot be saved while it is told so."""
+
+    refuses = False
+
+    def state_dict(self) -> dict[str, Any]:
+        if self.refuses:
+            raise OSError(28, "No space left on device")
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        pass
+
+
+def test_a_save_that_failed_half_way_leaves_nothing_out_of_the_next_one(tmp_path, small_config, make_run):
+    # The buffer is written first: the next save must write those rows again, for their files are gone.
+    run = make_run(small_config(), tmp_path)
+    part = Refusing()
+    run.parts["late"] = part
+    for save in (True, False, True):
+        for _ in range(8):
+            run.learner.step()
+        part.refuses = not save
+        if save:
+            assert run.save()
+        else:
+            with pytest.warns(UserWarning, match=r"no checkpoint at 32 env steps \(No space left on device\)"):
+                assert not run.save()
+    run.log.directory.close()
+    resumed = make_run(small_config(), tmp_path, resume=True)  # in which any warning is an error
+    assert resumed.env_steps == 48
+    expected, actual = (one.learner.replay[:] for one in (run, resumed))
+    assert (expected == actual).all()
 
 
 def fill(disk: Path) -> None:
@@ -341,7 +453,9 @@ def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(sm
     assert "no checkpoint at 60 env steps (No space left on device)" in str(warned[-1].message)
 
 
-def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written(small_disk, straight, small_config, make_run):
+def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written(
+    small_disk, straight, small_config, make_run
+):
     config = small_config()
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
@@ -361,7 +475,9 @@ def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written
     assert results(resumed, run_dir) == straight(config)
 
 
-def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_that_works(tmp_path, small_config, make_run):
+def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_that_works(
+    tmp_path, small_config, make_run
+):
     config = small_config()
     run = make_run(config, tmp_path)
     for _ in range(30):
@@ -369,13 +485,13 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     run.save()
     for _ in range(10):
         run.learner.step()
-    outcomes = []
+    outcomes, other = [], make_run(config, tmp_path / "other")  # takes every state in turn
     for moment in count(1):
         killed = killed_while_saving(run, moment)
-        resumed = make_run(config, tmp_path, resume=True)
-        outcomes.append((killed, resumed.env_steps))
-        assert len(resumed.learner.replay) == resumed.env_steps // 2
-        resumed.log.directory.close()
+        replay = build_replay(config)
+        CheckpointStore(tmp_path / "checkpoints").load(other.parts, replay)
+        outcomes.append((killed, other.env_steps))
+        assert len(replay) == other.env_steps // 2
         if not killed:
             break
     assert outcomes[0] == (True, 60)
@@ -396,12 +512,14 @@ def test_saving_the_same_step_again_never_leaves_it_without_a_checkpoint(tmp_pat
     for _ in range(30):
         run.learner.step()
     run.save()
-    killed = True
-    for moment in takewhile(lambda _: killed, count(1)):
+    for moment in count(1):
         killed = killed_while_saving(run, moment)
         store = CheckpointStore(tmp_path / "checkpoints")
         assert store.exists()
         assert store.load(run.parts, build_replay(config)).name == f"{60:012d}"
+        if not killed:
+            break
+    assert moment > 10
 
 
 def killed_while_saving(run: TrainingRun, moment: int) -> bool:

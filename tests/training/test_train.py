@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +45,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory, tiny_config, make_run) ->
     config = tiny_config(eval_policy=True)
     path = tmp_path_factory.mktemp("runs") / "cartpole"
     run = make_run(config, path)
-    return Finished(config, run, run.run(), path)
+    summary = run.run()
+    run.log.directory.close()
+    return Finished(config, run, summary, path)
 
 
 def test_a_run_directory_holds_what_it_should_and_nothing_else(finished):
@@ -73,7 +77,9 @@ def test_evaluations_are_at_the_start_at_every_interval_and_at_the_end(finished,
     assert all(0 < row["return_mean"] <= 2 * EPISODE for row in rows)
 
 
-def test_an_evaluation_due_at_the_end_of_the_seed_phase_is_of_the_pretrained_agent(tmp_path, tiny_config, make_run, read_table):
+def test_an_evaluation_due_at_the_end_of_the_seed_phase_is_of_the_pretrained_agent(
+    tmp_path, tiny_config, make_run, read_table
+):
     make_run(tiny_config(eval_every=60, total_env_steps=70), tmp_path).run()
     rows = read_table(tmp_path / "eval.csv")
     assert [(row["env_steps"], row["updates"]) for row in rows] == [(0, 0), (60, 7), (70, 7 + 2 * 5)]
@@ -85,8 +91,8 @@ def test_training_does_not_depend_on_how_often_it_is_evaluated(tmp_path, tiny_co
     seldom = make_run(tiny_config(eval_every=1000, total_env_steps=90), tmp_path / "seldom")
     seldom.run()
     assert torch.equal(often.learner.replay[:]["action"], seldom.learner.replay[:]["action"])
-    weights = zip(often.learner.agent.loss.state_dict().values(), seldom.learner.agent.loss.state_dict().values(), strict=True)
-    assert all(torch.equal(one, other) for one, other in weights)
+    weights, others = (run.learner.agent.loss.state_dict() for run in (often, seldom))
+    assert all(torch.equal(value, others[name]) for name, value in weights.items())
 
 
 def test_a_training_row_is_written_at_every_interval_after_the_seed_phase(finished, read_table):
@@ -153,6 +159,57 @@ def test_the_checkpoint_is_the_agent_at_the_end(finished):
 def test_the_environments_are_closed_at_the_end(finished):
     assert finished.run.learner.collector.env.is_closed
     assert finished.run.evaluator.env.is_closed
+
+
+def test_no_evaluation_and_no_checkpoint_is_jumped_over_by_several_environments(
+    tmp_path, tiny_config, make_run, read_table
+):
+    config = tiny_config(num_envs=3, total_env_steps=160, eval_every=40, checkpoint_every=50, checkpoint_keep=9)
+    make_run(config, tmp_path).run()
+    # Steps of 6; the 40 is in the random phase, which ends at 60.
+    assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 84, 120, 162]
+    checkpoints = sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir())
+    assert checkpoints == [102, 150, 162]
+    assert [row["env_steps"] for row in read_table(tmp_path / "train.csv")] == [84, 120, 162]
+
+
+def test_the_best_checkpoint_is_the_one_after_the_best_evaluation(tmp_path, tiny_config, make_run):
+    run = make_run(tiny_config(), tmp_path)
+    saved = {"best.pt": [], "last.pt": []}
+    for value in (3.0, 2.0, 5.0, 5.0, 4.0):
+        run.learner.step()
+        run.state.eval_returns.append(value)
+        assert run.save()
+        for name, decisions in saved.items():
+            _, _, counters = load_agent(tmp_path / "checkpoints" / name)
+            decisions.append(counters["decision_steps"])
+    assert saved == {"best.pt": [1, 1, 3, 4, 4], "last.pt": [1, 2, 3, 4, 5]}  # of two alike the later one
+
+
+def test_a_checkpoint_is_written_when_the_last_one_is_some_minutes_old(tmp_path, monkeypatch, tiny_config, make_run):
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    config = tiny_config(
+        checkpoint_minutes=2.0, checkpoint_every=10_000, checkpoint_keep=99, replay={"pretrain_updates": 1}
+    )
+    run = make_run(config, tmp_path)
+    act = run.learner.collector.act
+
+    def slow(*args: Any) -> TensorDictBase:
+        clock[0] += 13.0  # ten steps are more than two minutes
+        return act(*args)
+
+    run.learner.collector.act = slow
+    run.run()
+    checkpoints = sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir())
+    assert checkpoints == [20, 40, 60, 80, 100, 120, 140, 160]
+
+
+def test_without_minutes_only_the_interval_asks_for_a_checkpoint(tmp_path, monkeypatch, tiny_config, make_run):
+    clock = itertools.count(step=1e6)
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
+    make_run(tiny_config(checkpoint_minutes=None, checkpoint_keep=99, total_env_steps=90), tmp_path).run()
+    assert sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir()) == [80, 90]
 
 
 def test_every_decision_after_the_seed_phase_is_stored_with_a_planner_s_target(finished):
@@ -235,7 +292,8 @@ def test_pretraining_neither_distils_nor_reanalyzes(tmp_path, tiny_config, make_
     assert run.learner.agent.updater.updates == 7
     assert (run.learner.reanalyze.samples, run.learner.reanalyze.refreshed) == (0, 0)
     assert not torch.equal(run.learner.agent.world_model.encoder.output.weight, encoder)
-    assert all(torch.equal(value, policy[name]) for name, value in run.learner.agent.world_model.policy.state_dict().items())
+    after = run.learner.agent.world_model.policy.state_dict()
+    assert all(torch.equal(value, policy[name]) for name, value in after.items())
     run.learner.update()
     assert run.learner.reanalyze.refreshed == 0  # every decision is every second update
     run.learner.update()
@@ -278,7 +336,9 @@ class BreakingReward(Transform):
 
 
 @pytest.mark.parametrize(("steps", "updates"), [(10, 0), (33, 7 + 2 * 3)], ids=["while seeding", "while learning"])
-def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(tmp_path, steps, updates, tiny_config, make_run):
+def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(
+    tmp_path, steps, updates, tiny_config, make_run
+):
     run = make_run(tiny_config(max_faults=3), tmp_path, BreakingReward(steps))
     message = rf"reward.* at decision step {steps} .*; training goes on with a fresh episode \(failure \d\)\.$"
     with (

@@ -367,11 +367,14 @@ class SeparateSteps:
 
 
 def test_gradients_do_not_accumulate_over_updates():
-    updater, batch = make_updater(tau=0.0, lr=0.0), make_batch()  # nothing moves, so every gradient is the first again
+    # A rate that moves nothing, so every gradient is the first again.
+    updater, batch = make_updater(tau=0.0, lr=1e-300), make_batch()
+    weights = [parameter.clone() for parameter in updater.loss.world_model.parameters()]
     recorded = applied_gradients(updater)
     for distill in (True, True, False, True):
         seeded_step(updater, batch, distill=distill)
         assert all(parameter.grad is None for parameter in updater.loss.world_model.parameters())
+    assert all(map(torch.equal, weights, updater.loss.world_model.parameters()))
     assert (len(recorded["model"]), len(recorded["policy"])) == (4, 3)
     for first, *others in recorded.values():
         assert norm(first) > 0
@@ -432,3 +435,20 @@ def test_an_update_without_a_finite_gradient_changes_nothing_but_the_count(poiso
     assert metrics["loss_reward"].isfinite()
     assert (int(updater.skipped), int(updater.skipped_in_a_row)) == (2, 0)
     assert not any(map(torch.equal, weights[:1], updater.loss.world_model.parameters()))
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"lr": 0.0}, "lr must be positive, got 0.0."),
+        ({"grad_clip_norm": -1.0}, "grad_clip_norm must be positive, got -1.0."),
+        ({"encoder_lr_scale": -0.1}, "encoder_lr_scale must not be negative, got -0.1."),
+        ({"tau": 1.5}, "tau must be in [0, 1], got 1.5."),
+    ],
+    ids=lambda case: next(iter(case)) if isinstance(case, dict) else "",
+)
+def test_an_option_out_of_range_is_refused(option, message):
+    loss = EfficientTDMPCLoss(make_world_model(), discount=0.9)
+    with pytest.raises(ValueError) as caught:
+        Updater(loss, **option)
+    assert str(caught.value) == message

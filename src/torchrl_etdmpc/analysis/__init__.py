@@ -13,7 +13,14 @@ except ImportError as error:
         f"torchrl_etdmpc.analysis needs {error.name}, which is not installed; run: pip install torchrl_etdmpc[analysis]"
     ) from error
 
-from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS, HUMANOIDBENCH_HARD, Benchmark, benchmark_of, get_benchmark
+from torchrl_etdmpc.analysis.benchmarks import (
+    BENCHMARKS,
+    HUMANOIDBENCH_HARD,
+    Benchmark,
+    benchmark_of,
+    get_benchmark,
+    own_benchmark,
+)
 from torchrl_etdmpc.analysis.comparison import Comparison, compare, merge_estimates
 from torchrl_etdmpc.analysis.curves import find_runs, join_curves, read_curves, read_run, read_runs
 from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run
@@ -58,6 +65,7 @@ __all__ = [
     "method_styles",
     "normalise",
     "normalisers",
+    "own_benchmark",
     "plot_aggregate",
     "plot_auc",
     "plot_curves",

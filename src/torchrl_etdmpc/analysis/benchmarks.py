@@ -70,6 +70,19 @@ def get_benchmark(name: str) -> Benchmark:
     return BENCHMARKS[name]
 
 
+def own_benchmark(tasks: Iterable[str], budget: int) -> Benchmark:
+    """The tasks of no published benchmark as one: nothing normalises them, and no baseline joins.
+
+    Args:
+        tasks (iterable of str): names such as ``gym/Hopper-v5`` or ``module:function``.
+        budget (int): env steps.
+
+    >>> own_benchmark(["gym/Hopper-v5"], 100_000).title
+    'Tasks without a benchmark'
+    """
+    return Benchmark("own", "Tasks without a benchmark", tuple(tasks), budget, 1)
+
+
 def benchmark_of(tasks: Iterable[str]) -> Benchmark:
     """The benchmark that holds all of the tasks.
 

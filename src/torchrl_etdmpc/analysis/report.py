@@ -102,12 +102,16 @@ def _page(comparison: Comparison, files: dict[str, str], figures: list[str]) -> 
     benchmark, grid = comparison.benchmark, comparison.grid
     count, total = len(comparison.tasks), len(benchmark.tasks)
     scope = f"all {total} tasks" if count == total else f"{count} of its {total} tasks, over which aggregates are taken"
+    normalised = "Nothing normalises these tasks, so that areas and aggregates are unavailable. "
+    if len(comparison.constants):
+        by = f"{NORMALISER}'s mean return on the task at {benchmark.budget:,} env steps"
+        normalised = f"Normalised by {by}. "
     parts = [
         f"# {benchmark.title}: {', '.join(comparison.methods)}\n",
         f"Budget {comparison.budget:,} environment steps; {scope}. Evaluation grid of the AUC: {grid[0]:,.0f} to "
-        f"{grid[-1]:,.0f} every {grid[1] - grid[0]:,.0f} env steps, trapezoid rule, env steps in millions. Normalised "
-        f"by {NORMALISER}'s mean return on the task at {benchmark.budget:,} env steps. In brackets: number of seeds of "
-        "each figure. Best in bold, second best in italics; a dash is unavailable.\n",
+        f"{grid[-1]:,.0f} every {grid[1] - grid[0]:,.0f} env steps, trapezoid rule, env steps in millions. "
+        + normalised
+        + "In brackets: number of seeds of each figure. Best in bold, second best in italics; a dash is unavailable.\n",
         "## Area under the normalised learning curve\n",
         files["auc.md"],
         f"![areas](auc.png)\n\n## Return at {comparison.budget:,} environment steps\n",

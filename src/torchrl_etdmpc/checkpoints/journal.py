@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -75,28 +75,34 @@ class ReplayJournal:
             OSError: if a file cannot be written; the journal stays as it was.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        capacity, written = buffer.storage.max_size, buffer.writer._write_count
+        capacity, written = buffer.storage.max_size, _write_count(buffer)
         old = self.state
-        new = {"capacity": capacity, "written": written, "version": version}
+        new: dict[str, Any] = {"capacity": capacity, "written": written, "version": version}
         new["rows"] = [entry for entry in old["rows"] if entry["end"] > written - capacity]
         new["targets"] = old["targets"]
         if written:
-            stored = buffer.storage[:]
+            stored: TensorDictBase = buffer.storage[:]
             targets = [key for key in self._target_keys if key in stored.keys(True, True)]
             begin = max(old["written"], written - capacity)
             for start in range(begin, written, ROWS_PER_FILE):
                 end = min(start + ROWS_PER_FILE, written)
-                rows = stored.exclude("index", *targets)[torch.arange(start, end, device=stored.device) % capacity]
-                entry = self._write(f"rows-{start:012d}", rows)
+                # Write number r stands in row r modulo the capacity, so this also reads across the ring's end.
+                position = torch.arange(start, end, device=stored.device) % capacity
+                entry = self._write(f"rows-{start:012d}", _rows(stored.exclude("index", *targets), position))
                 new["rows"] = [*new["rows"], entry | {"begin": start, "end": end}]
             if targets:
                 new["targets"] = self._save_targets(stored.select(*targets), old, begin, written, capacity)
-        self.state = new
+        self.state = new  # last: a failed save must leave the journal where it was, or those rows are never written
         return new
 
     def _save_targets(
         self, stored: TensorDictBase, old: dict[str, Any], begin: int, written: int, capacity: int
     ) -> list[dict[str, Any]]:
+        """Writes the targets that changed since the last save, or a whole part where too many have piled up.
+
+        A target says by its model version when it was computed. That finds what reanalyze rewrote, but not every new
+        row: one of the random phase has version 0 for ever. So the rows written since count as changed in any case.
+        """
         changed = stored.get(self._version_key).reshape(len(stored)) >= old["version"]
         changed[torch.arange(begin, written, device=changed.device) % capacity] = True
         size = -(-capacity // PARTS)
@@ -116,7 +122,7 @@ class ReplayJournal:
                 entry = self._write(name, stored[low:high].clone())
                 entries[part] = [entry | {"part": part, "rows": high - low, "begin": low}]
             elif len(index):
-                entry = self._write(name, stored[index].set("index", index.to(torch.int32)))
+                entry = self._write(name, _rows(stored, index).set("index", index.to(torch.int32)))
                 entries[part] = [*entries[part], entry | {"part": part, "rows": len(index)}]
         return [entry for part in range(PARTS) for entry in entries[part]]
 
@@ -144,30 +150,38 @@ class ReplayJournal:
                 f"be loaded into one of capacity {capacity}."
             )
         if written:
-            rows = torch.cat([self._read(entry) for entry in files["rows"]])
-            first = files["rows"][0]["begin"]
-            rows = rows[
-                max(written - files["capacity"], 0) - first :
-            ]  # the oldest file may hold rows overwritten since
+            rows = self._read_rows(files)
             position = torch.arange(written - len(rows), written) % capacity
-            content: TensorDict | None = None
-            for entry in files["targets"]:
-                change = self._read(entry)
-                begin = entry.get("begin")
-                index = change.pop("index").long() if begin is None else slice(begin, begin + entry["rows"])
-                if content is None:
-                    content = change.new_zeros(len(rows))
-                content[index] = change
-            if content is not None:
-                rows = rows.update(content[position])
+            targets = self._read_targets(files, len(rows))
+            if targets is not None:
+                rows.update(_rows(targets, position))
             rows.set("index", position)  # TensorDict buffers number their rows
-            buffer.storage.set(position.to(_device(buffer)), rows.to(_device(buffer)))
+            device = _device(buffer)
+            buffer.storage.set(position.to(device), rows.to(device))  # pyright: ignore[reportArgumentType]
             state = {"_cursor": written % capacity, "_write_count": written}
             if buffer.writer.tracks_generations:  # how often each row has been written, from 0; -1 for never
                 times = (written - 1 - torch.arange(capacity)).div(capacity, rounding_mode="floor")
                 state["_generation"] = times.clamp(min=-1)
             buffer.writer.load_state_dict(state)
         self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
+
+    def _read_rows(self, files: Mapping[str, Any]) -> TensorDictBase:
+        """The rows that are still in the buffer, in the order of their writing, without their targets."""
+        rows = cast(TensorDictBase, torch.cat([self._read(entry) for entry in files["rows"]]))
+        overwritten = max(files["written"] - files["capacity"], 0) - files["rows"][0]["begin"]  # of the oldest file
+        return _rows(rows, slice(overwritten, None))
+
+    def _read_targets(self, files: Mapping[str, Any], count: int) -> TensorDictBase | None:
+        """The targets of every row of the buffer, or ``None`` if it has none: each part's base, then its changes."""
+        content: TensorDictBase | None = None
+        for entry in files["targets"]:
+            change = self._read(entry)
+            begin = entry.get("begin")  # a base is a range of rows, a change lists them
+            index = change.pop("index").long() if begin is None else slice(begin, begin + entry["rows"])
+            if content is None:
+                content = cast(TensorDictBase, change.new_zeros(torch.Size([count])))
+            content[index] = change
+        return content
 
     def _read(self, entry: Mapping[str, Any]) -> TensorDict:
         content = read_tensors(self.folder / entry["file"], entry["sha256"])
@@ -191,6 +205,15 @@ def _leaves(content: Mapping[str, Any]) -> Iterable[Tensor]:
         yield from _leaves(value) if isinstance(value, Mapping) else (value,)
 
 
+def _rows(stored: TensorDictBase, index: Tensor | slice) -> TensorDictBase:
+    return stored[index]  # pyright: ignore[reportReturnType]  # typed as if it could be a leaf
+
+
+def _write_count(buffer: TensorDictReplayBuffer) -> int:
+    """How many rows were ever written to the buffer: what a writer stores of itself."""
+    return int(buffer.writer.state_dict()["_write_count"])
+
+
 def _device(buffer: TensorDictReplayBuffer) -> torch.device | str:
-    device = buffer.storage.device
+    device = getattr(buffer.storage, "device", "cpu")
     return "cpu" if device == "auto" else device

@@ -1,6 +1,7 @@
-"""Collection, one step at a time."""
+"""Acting in environments: collection one step at a time, and evaluation."""
 
+from torchrl_etdmpc.collectors.evaluate import evaluate
 from torchrl_etdmpc.collectors.seed_policy import SeedPolicy
 from torchrl_etdmpc.collectors.step import NonFiniteError, SimulatorError, StepCollector
 
-__all__ = ["NonFiniteError", "SeedPolicy", "SimulatorError", "StepCollector"]
+__all__ = ["NonFiniteError", "SeedPolicy", "SimulatorError", "StepCollector", "evaluate"]

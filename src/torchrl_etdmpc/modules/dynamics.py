@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchrl_etdmpc.functional import simnorm
-from torchrl_etdmpc.modules.normed_linear import MLP, Activation
+from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
 
 
-class DynamicsEnsemble(MLP):
+class DynamicsEnsemble(LayerStack):
     """``F`` independent dynamics heads, ``z' = f_i(z, a)`` (thesis 3.4.1). Members share nothing.
 
     Args:

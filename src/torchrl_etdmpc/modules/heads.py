@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchrl_etdmpc.modules.normed_linear import MLP, Activation
+from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
 
 
-class RewardHead(MLP):
+class RewardHead(LayerStack):
     """Latent and action to the logits of the reward's symlog two-hot distribution (thesis Table 3.1).
 
     Args:
@@ -38,10 +38,10 @@ class RewardHead(MLP):
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
         """``latent [..., L]`` and ``action`` (broadcastable to ``[..., A]``) to logits ``[..., M]``."""
         action = action.expand(*latent.shape[:-1], action.shape[-1])
-        return super().forward(torch.cat([latent, action], dim=-1))
+        return self.through(torch.cat([latent, action], dim=-1))
 
 
-class ValueEnsemble(MLP):
+class ValueEnsemble(LayerStack):
     """``V`` independent state-value heads, latent to symlog two-hot logits (thesis Table 3.1; BMPC).
 
     Args:
@@ -79,10 +79,10 @@ class ValueEnsemble(MLP):
 
     def forward(self, latent: Tensor, *, dropout: bool = False) -> Tensor:
         """``latent [..., L]`` to logits ``[V, ..., M]``; dropout (independent per head) only when asked for."""
-        return super().forward(latent.expand(self.num_heads, *latent.shape), dropout=dropout)
+        return self.through(latent.expand(self.num_heads, *latent.shape), dropout=dropout)
 
 
-class TerminationHead(MLP):
+class TerminationHead(LayerStack):
     """Latent to the logit of the probability that the episode terminated on reaching it.
 
     Args:
@@ -99,4 +99,4 @@ class TerminationHead(MLP):
 
     def forward(self, latent: Tensor) -> Tensor:
         """``latent [..., L]`` to logits ``[...]``."""
-        return super().forward(latent).squeeze(-1)
+        return self.through(latent).squeeze(-1)

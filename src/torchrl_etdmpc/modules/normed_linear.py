@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 import torch.nn.functional as F
@@ -126,8 +126,10 @@ class NormedLinear(EnsembleLinear):
         return self.activation(x)
 
 
-class MLP(nn.Module):
+class LayerStack(nn.Module):
     """Hidden :class:`NormedLinear` layers and one output layer, for one network or a stack of them.
+
+    A subclass says in ``forward`` what goes in and what comes out; :class:`MLP` is the plain one.
 
     Args:
         in_features (int): input size.
@@ -142,10 +144,10 @@ class MLP(nn.Module):
 
     Raises:
         ValueError: if the activation is unknown or the dropout out of range.
-
-    >>> MLP(3, [16], 2, num_members=4)(torch.zeros(4, 7, 3)).shape
-    torch.Size([4, 7, 2])
     """
+
+    hidden: Sequence[NormedLinear]
+    output: EnsembleLinear
 
     def __init__(
         self,
@@ -163,7 +165,7 @@ class MLP(nn.Module):
         if activation not in get_args(Activation):
             raise ValueError(f"activation must be one of {', '.join(get_args(Activation))}, got {activation!r}.")
         sizes = [in_features, *hidden_sizes]
-        self.hidden = nn.ModuleList(
+        layers = nn.ModuleList(
             NormedLinear(
                 size_in,
                 size_out,
@@ -173,12 +175,13 @@ class MLP(nn.Module):
             )
             for i, (size_in, size_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True))
         )
+        self.hidden = cast("Sequence[NormedLinear]", layers)  # a ModuleList does not tell the type of its members
         if output_activation is None:
             self.output = EnsembleLinear(sizes[-1], out_features, num_members=num_members, zero_init=zero_init_output)
         else:
             self.output = NormedLinear(sizes[-1], out_features, activation=output_activation, num_members=num_members)
 
-    def forward(self, x: Tensor, *, dropout: bool = False) -> Tensor:
+    def through(self, x: Tensor, *, dropout: bool = False) -> Tensor:
         """``[..., in] -> [..., out]``, or ``[E, ..., in] -> [E, ..., out]``; dropout only when asked for."""
         for layer in self.hidden:
             x = layer(x, dropout=dropout)
@@ -188,3 +191,15 @@ class MLP(nn.Module):
         """Draws new weights in every layer (the hook that TorchRL's losses call)."""
         for layer in (*self.hidden, self.output):
             layer.reset_parameters()
+
+
+class MLP(LayerStack):
+    """A :class:`LayerStack` from one tensor to one tensor.
+
+    >>> MLP(3, [16], 2, num_members=4)(torch.zeros(4, 7, 3)).shape
+    torch.Size([4, 7, 2])
+    """
+
+    def forward(self, x: Tensor, *, dropout: bool = False) -> Tensor:
+        """``[..., in] -> [..., out]``, or ``[E, ..., in] -> [E, ..., out]``; dropout only when asked for."""
+        return self.through(x, dropout=dropout)

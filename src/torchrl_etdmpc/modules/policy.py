@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchrl_etdmpc.functional import bounded_log_std
-from torchrl_etdmpc.modules.normed_linear import MLP, Activation
+from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
 
 
-class GaussianPolicy(MLP):
+class GaussianPolicy(LayerStack):
     """Latent to ``mean = tanh(m)`` and a bounded log standard deviation (thesis 2.4, BMPC).
 
     An action is ``clip(mean + std * eps, -1, 1)``; the density is that of the unclipped Gaussian.
@@ -56,5 +56,5 @@ class GaussianPolicy(MLP):
         Returns:
             tuple[Tensor, Tensor]: mean in (-1, 1) and log std, both of shape ``[..., A]``.
         """
-        mean, raw = super().forward(latent).chunk(2, dim=-1)
+        mean, raw = self.through(latent).chunk(2, dim=-1)
         return mean.tanh(), bounded_log_std(raw, *(log_std_bounds or self.log_std_bounds))

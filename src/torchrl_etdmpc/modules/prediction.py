@@ -102,18 +102,19 @@ def require_prediction_model(model: object) -> None:
 
 
 def device_and_dtype(
-    model: nn.Module, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    model: nn.Module | PredictionModel, device: torch.device | str | None = None, dtype: torch.dtype | None = None
 ) -> tuple[torch.device, torch.dtype]:
     """Where a model's inputs go: device and dtype of its first floating-point parameter or buffer.
 
     Args:
-        model (nn.Module): of one device and one dtype.
+        model (nn.Module): of one device and one dtype, e.g. a :class:`PredictionModel`.
         device (torch.device or str, optional): for a model without parameters and buffers. Default: PyTorch's own.
         dtype (torch.dtype, optional): for such a model. Default: PyTorch's own.
 
     >>> device_and_dtype(nn.Linear(3, 2).double())
     (device(type='cpu'), torch.float64)
     """
+    assert isinstance(model, nn.Module)
     for tensors in (model.parameters(), model.buffers()):
         for tensor in tensors:
             if tensor.is_floating_point():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 
@@ -9,7 +12,7 @@ from torchrl_etdmpc.functional import clipped_sample, two_hot_decode
 from torchrl_etdmpc.modules.dynamics import DynamicsEnsemble
 from torchrl_etdmpc.modules.encoder import Encoder
 from torchrl_etdmpc.modules.heads import RewardHead, TerminationHead, ValueEnsemble
-from torchrl_etdmpc.modules.normed_linear import Activation
+from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
 from torchrl_etdmpc.modules.policy import GaussianPolicy
 
 
@@ -147,7 +150,7 @@ class WorldModel(nn.Module):
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights in every network (the hook that TorchRL's losses call)."""
-        for network in self.children():
+        for network in cast("Iterator[LayerStack]", self.children()):
             network.reset_parameters_recursive()
         self.version.zero_()
 

@@ -7,8 +7,15 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import ExtraTerm, LatentRollout, LatentRolloutLoss, Reduction, Slices
-from torchrl_etdmpc.objectives.policy import KLDirection, policy_terms, register_running_scale
+from torchrl_etdmpc.objectives.latent_rollout import (
+    ExtraTerm,
+    KLDirection,
+    LatentRollout,
+    LatentRolloutLoss,
+    Reduction,
+    Slices,
+)
+from torchrl_etdmpc.objectives.policy import policy_terms, register_running_scale
 from torchrl_etdmpc.objectives.value import register_discount, value_terms
 from torchrl_etdmpc.objectives.world_model import model_terms
 

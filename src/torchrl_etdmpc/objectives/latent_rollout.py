@@ -17,6 +17,7 @@ from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SC
 from torchrl_etdmpc.modules import WorldModel
 
 Reduction = Literal["none", "mean", "sum"]
+KLDirection = Literal["backward", "forward"]
 
 
 class Slices(NamedTuple):
@@ -133,7 +134,7 @@ class LatentRolloutLoss(LossModule):
     # their weight; the unweighted values are the metrics that end in "_error" or "_kl".
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Configurable tensordict keys.
 
         Attributes:
@@ -153,12 +154,13 @@ class LatentRolloutLoss(LossModule):
         plan_loc: NestedKey = (PLAN, LOC)
         plan_scale: NestedKey = (PLAN, SCALE)
 
-    tensor_keys: _AcceptedKeys
+    tensor_keys: _AcceptedKeys  # pyright: ignore[reportIncompatibleMethodOverride]
     default_keys = _AcceptedKeys
-    default_value_estimator = None
+    default_value_estimator = None  # pyright: ignore[reportAssignmentType]
 
     world_model: WorldModel
     rho: Tensor
+    # Each loss has what its networks and terms need of the following.
     encoder: nn.Module
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
@@ -177,6 +179,11 @@ class LatentRolloutLoss(LossModule):
     policy: nn.Module
     policy_params: TensorDictParams
     target_policy_params: TensorDictParams
+    discount: Tensor
+    entropy_coef: Tensor
+    kl_scale: Tensor
+    scale_tau: float
+    kl_direction: KLDirection
 
     _attributes: ClassVar[dict[str, str]] = {
         "encoder": "encoder",
@@ -210,7 +217,7 @@ class LatentRolloutLoss(LossModule):
             module = getattr(world_model, self._attributes[name])
             if module is not None:
                 self.convert_to_functional(module, name, create_target_params=name == "value")
-        self.__dict__["world_model"] = world_model
+        vars(self)["world_model"] = world_model
         for term, coefficient in coefficients.items():
             self.register_coeff_buffer(f"{term}_coef", float(coefficient))
         self.register_buffer("rho", torch.tensor(float(rho)))
@@ -247,9 +254,10 @@ class LatentRolloutLoss(LossModule):
         for name in self._attributes:
             if f"{name}_params" in self._modules:
                 self.__dict__[name].reset_parameters_recursive()
-        for name, target in self._modules.items():
+        parameters: dict[str, Any] = self._modules
+        for name, target in parameters.items():
             if name.startswith("target_"):
-                target.data.update_(self._modules[name.removeprefix("target_")].data)
+                target.data.update_(parameters[name.removeprefix("target_")].data)
 
     @property
     @abc.abstractmethod
@@ -284,7 +292,7 @@ class LatentRolloutLoss(LossModule):
         return self._in_keys
 
     @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
+    def in_keys(self, keys: list[NestedKey]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._in_keys = keys
 
     @property
@@ -296,7 +304,7 @@ class LatentRolloutLoss(LossModule):
         return self._out_keys
 
     @out_keys.setter
-    def out_keys(self, keys: list[str]) -> None:
+    def out_keys(self, keys: list[str]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._out_keys = keys
 
     def slices(self, tensordict: TensorDictBase) -> Slices:
@@ -311,7 +319,7 @@ class LatentRolloutLoss(LossModule):
             KeyError: if a key is missing.
         """
         self._refuse_termination(tensordict)
-        fields = dict.fromkeys(Slices._fields)
+        fields: dict[str, Any] = dict.fromkeys(Slices._fields)
         for name in self._reads:
             value = tensordict.get(self._key(name), None)
             if value is None:
@@ -344,7 +352,7 @@ class LatentRolloutLoss(LossModule):
                 f"{type(self).__name__}(..., ignore_termination=True) if that is what you want."
             )
 
-    @dispatch
+    @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms on a batch of slices.
 
@@ -369,7 +377,7 @@ class LatentRolloutLoss(LossModule):
 
     def target_values(self) -> dict[str, Tensor] | None:
         """The target parameters of the value heads by name, or ``None`` if this loss has none."""
-        targets = self._modules.get("target_value_params")
+        targets: Any = self._modules.get("target_value_params")
         if targets is None:
             return None
         names = ((name, ".".join((name,) if isinstance(name, str) else name)) for name in targets.keys(True, True))

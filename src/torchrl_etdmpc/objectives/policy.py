@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import (
+    KLDirection,
     LatentRollout,
     LatentRolloutLoss,
     Reduction,
@@ -17,8 +18,6 @@ from torchrl_etdmpc.objectives.latent_rollout import (
     head_rows,
     mean_of_head_rows,
 )
-
-KLDirection = Literal["backward", "forward"]
 
 
 class Distillation(NamedTuple):
@@ -143,6 +142,7 @@ def policy_terms(
     loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Term ``[T, B]`` and metrics of the policy, for any loss with a running scale."""
+    assert slices.plan_loc is not None and slices.plan_scale is not None
     heads = loss.world_model.num_dynamics
     latent = head_rows(rollout.predicted[:-1])
     plan = head_rows(slices.plan_loc, heads), head_rows(slices.plan_scale, heads)

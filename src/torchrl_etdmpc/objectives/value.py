@@ -147,9 +147,10 @@ def register_discount(loss: LatentRolloutLoss, discount: float) -> None:
 
 
 def value_terms(
-    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor]
+    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Term ``[T, B]`` and metrics of the value heads, for any loss that owns target value parameters."""
+    assert target_values is not None  # a loss that trains the value heads has targets of them
     world_model = loss.world_model
 
     def values(latent: Tensor) -> Tensor:

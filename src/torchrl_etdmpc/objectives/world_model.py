@@ -44,6 +44,7 @@ def reward_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices
     Returns:
         Tensor: mean over heads, shape ``[T, B]``.
     """
+    assert slices.reward is not None
     heads = world_model.num_dynamics
     logits = world_model.reward_head(head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads))
     error = two_hot_cross_entropy(logits, head_rows(slices.reward, heads), world_model.bins)
@@ -61,6 +62,7 @@ def termination_error(world_model: WorldModel, rollout: LatentRollout, slices: S
     Returns:
         Tensor: mean over heads, shape ``[T, B]``.
     """
+    assert world_model.termination_head is not None and slices.terminated is not None
     logits = world_model.termination_head(rollout.predicted[1:])
     flags = slices.terminated.unsqueeze(1).expand_as(logits).to(logits.dtype)
     return F.binary_cross_entropy_with_logits(logits, flags, reduction="none").mean(1)

@@ -1,5 +1,6 @@
 """Planners, their objectives, and the imagined environment that they plan in."""
 
+from torchrl_etdmpc.planners.bare_policy import BarePolicy
 from torchrl_etdmpc.planners.ensemble_mppi import EnsembleMPPIPlanner, FirstAction, ScoringDtype
 from torchrl_etdmpc.planners.export import export_planner, export_policy
 from torchrl_etdmpc.planners.latent_env import LatentEnv
@@ -18,6 +19,7 @@ from torchrl_etdmpc.planners.scores import (
 
 __all__ = [
     "AdaptiveScore",
+    "BarePolicy",
     "Depths",
     "EnsembleMPPIPlanner",
     "FinalScore",

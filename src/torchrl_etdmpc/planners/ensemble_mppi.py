@@ -118,6 +118,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     torch.Size([5, 2])
     """
 
+    env: LatentEnv
+
     def __init__(
         self,
         env: LatentEnv,
@@ -160,7 +162,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(FirstAction))}, got {choice!r}.")
         super().__init__(env, action_key=action_key)
         del self._modules["env"]  # the base class registers it twice; the state dict should list the weights once
-        self.__dict__["env"] = env
+        vars(self)["env"] = env
         self.horizon = horizon
         self.num_samples = num_samples
         self.num_elites = num_elites
@@ -178,7 +180,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.scoring_dtype = _floating_dtype(scoring_dtype)
         self.proposal_log_std_bounds = _both_or_none(proposal_log_std_min, proposal_log_std_max)
         self.compiled_plan: Callable[..., Plan] | None = None
-        self.__dict__["_imagination"] = _Imagination(env.world_model)
+        vars(self)["_imagination"] = _Imagination(env.world_model)
         self.observation_key = unravel_key(observation_key)
         self.latent_key = None if latent_key is None else unravel_key(latent_key)
         self.is_init_key = unravel_key(is_init_key)
@@ -187,12 +189,10 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}
         self._warned_cold = False
         carried = [self.is_init_key, self.plan_mean_key] if warm_start else []
-        self.in_keys = [self.observation_key, *carried]
-        self.out_keys = [
-            unravel_key(action_key),
-            *self.plan_keys.values(),
-            *([self.next_plan_mean_key] if warm_start else []),
-        ]
+        written = [*self.plan_keys.values(), *([self.next_plan_mean_key] if warm_start else [])]
+        # TorchRL's types know one key only.
+        self.in_keys = [self.observation_key, *carried]  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = [unravel_key(action_key), *written]  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def world_model(self) -> PredictionModel:
@@ -208,7 +208,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
         Collectors find it by themselves (``auto_register_policy_transforms=True``).
         """
-        spec = Unbounded((self.horizon, self.world_model.action_dim))
+        spec = Unbounded(torch.Size([self.horizon, self.world_model.action_dim]))
         return TensorDictPrimer({self.plan_mean_key: spec}, default_value=0.0, expand_specs=True)
 
     def planning(self, td: TensorDictBase) -> Tensor:
@@ -216,7 +216,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         return self(td.copy()).get(self.out_keys[0])
 
     @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None) -> TensorDictBase:
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]  # the base class takes kwargs only to refuse them
+        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
+    ) -> TensorDictBase:
         """Plans for every state of the batch and writes action, target and warm start.
 
         Args:
@@ -331,8 +333,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
         Returns:
             Plan: see its fields.
+
+        Raises:
+            ValueError: if neither an observation nor a latent is given.
         """
         if latent is None:
+            if observation is None:
+                raise ValueError("plan needs an observation or a latent, got neither.")
             latent = self.world_model.encode(observation)
         batch = latent.shape[:-1]
         latent = latent.reshape(-1, latent.shape[-1])
@@ -351,18 +358,18 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         outputs = (action, loc, scale, value, search.gaussian.mean, search.fallback)
         outputs = [field.reshape(batch + field.shape[1:]) for field in outputs]
         if not trace:
-            return Plan(*outputs, None)
+            return Plan(*outputs, trace=None)
         stacked = (torch.stack(field, dim=1) for field in zip(*search.steps, strict=True))
-        return Plan(*outputs, PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
+        return Plan(*outputs, trace=PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
 
     def _search(self, latent: Tensor, gaussian: Gaussian, noise: PlanNoise, trace: bool) -> _Search:
         """Draws candidates, scores them and refits the Gaussian, once per iteration, for states ``[B, L]``."""
         weights_cast = self._cast_weights(latent)
         proposals = self._proposals(latent, noise.proposals)
-        steps = []
+        steps, proposed = [], None
         for iteration in range(self.iterations):
             actions = sample_sequences(gaussian, noise.candidates[:, iteration])
-            if iteration == 0:
+            if proposed is None:
                 actions = torch.cat([proposals, actions], dim=1)
                 scores, returns = self._evaluate(latent, actions, weights_cast)
                 proposed = proposals, scores[:, : self.num_proposals], returns[:, : self.num_proposals]
@@ -377,7 +384,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             gaussian = Gaussian(*(torch.where(keep, old, new) for old, new in zip(gaussian, fitted, strict=True)))
             if trace:
                 steps.append(PlanTrace(actions, scores, returns, *gaussian))
-        return _Search(gaussian, elites, weights, fallback, steps)
+        # There is at least one iteration.
+        return _Search(gaussian, elites, weights, fallback, steps)  # pyright: ignore[reportPossiblyUnboundVariable]
 
     def _proposals(self, latent: Tensor, noise: Tensor) -> Tensor:
         """The policy's sequences ``[B, P, H, A]``."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
@@ -33,7 +36,7 @@ class _Planner(nn.Module):
 def export_policy(world_model: PredictionModel) -> ExportedProgram:
     """The policy without the planner: ``observation [B, O] -> action [B, A]``, any B.
 
-    The action is the policy's mean, in [-1, 1].
+    The action is the policy's mean, in [-1, 1]. The program holds copies of the weights that it needs and no others.
 
     Args:
         world_model (PredictionModel): encoder and policy, an ``nn.Module``.
@@ -48,16 +51,15 @@ def export_policy(world_model: PredictionModel) -> ExportedProgram:
     """
     device, dtype = device_and_dtype(world_model)
     example = torch.zeros(2, world_model.observation_dim, device=device, dtype=dtype)
-    shapes = {"observation": {0: Dim("batch")}}
-    with torch.no_grad():
-        return torch.export.export(_Policy(world_model), (example,), dynamic_shapes=shapes)
+    return _export(_Policy(world_model), example, dynamic_shapes={"observation": {0: Dim("batch")}})
 
 
 def export_planner(planner: EnsembleMPPIPlanner, *, batch_size: int = 1) -> ExportedProgram:
     """The planner as it evaluates: ``observation [B, O], plan_mean [B, H, A] -> action [B, A], plan_mean [B, H, A]``.
 
     ``plan_mean`` is the warm start: zeros at the beginning of an episode, then what the call before returned. The
-    candidates' noise is drawn inside, from PyTorch's global generator. A compiled plan is left aside.
+    candidates' noise is drawn inside, from PyTorch's global generator. A compiled plan is left aside. The program holds
+    copies of the weights.
 
     Args:
         planner (EnsembleMPPIPlanner): with its world model.
@@ -77,5 +79,20 @@ def export_planner(planner: EnsembleMPPIPlanner, *, batch_size: int = 1) -> Expo
     device, dtype = planner.env.device_and_dtype()
     observation = torch.zeros(batch_size, model.observation_dim, device=device, dtype=dtype)
     plan_mean = torch.zeros(batch_size, planner.horizon, model.action_dim, device=device, dtype=dtype)
-    with torch.no_grad():
-        return torch.export.export(_Planner(planner), (observation, plan_mean))
+    return _export(_Planner(planner), observation, plan_mean)
+
+
+@torch.no_grad()
+def _export(module: nn.Module, *inputs: Tensor, **options: Any) -> ExportedProgram:
+    # A copy has memory of its own. The live weights go on changing, and may be views of one piece of memory (an updater
+    # makes them so), of which a file would hold all.
+    module = copy.deepcopy(module)
+    program = torch.export.export(module, inputs, **options)
+    # PyTorch stores every parameter of the module, whether the program reads it or not.
+    read = {node.name for node in program.graph.find_nodes(op="placeholder") if node.users}
+    needed = {spec.target for spec in program.graph_signature.input_specs if spec.arg.name in read}
+    needless = [name for name, _ in module.named_parameters() if name not in needed]
+    for name in needless:
+        owner, _, attribute = name.rpartition(".")
+        delattr(module.get_submodule(owner), attribute)
+    return torch.export.export(module, inputs, **options) if needless else program

@@ -97,5 +97,6 @@ def _survival(world_model: PredictionModel, latents: list[Tensor]) -> Tensor | N
     """Probability ``[B, N, H, F]`` of being alive at each latent ``[F, B, N, L]``; ``None``: nothing terminates."""
     # Departure from the thesis and TD-MPC2, which cut a rollout where the probability passes a threshold: as a weight,
     # a calibrated probability counts for what it is.
-    ended = [world_model.termination(latent) for latent in latents]
-    return None if ended[0] is None else (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1)
+    predicted = [world_model.termination(latent) for latent in latents]
+    ended = [probability for probability in predicted if probability is not None]
+    return (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1) if ended else None

@@ -56,19 +56,19 @@ class LatentEnv(ModelBasedEnvBase):
         if head is not None and not 0 <= head < world_model.num_dynamics:
             raise ValueError(f"head must be in 0..{world_model.num_dynamics - 1} or None, got {head}.")
         device, dtype = device_and_dtype(world_model, device, dtype)
-        super().__init__(world_model, device=device)
+        super().__init__(world_model, device=device)  # pyright: ignore[reportArgumentType]  # any module will do
         self.head = head
         like = {"device": device, "dtype": dtype}
-        size = (world_model.latent_dim,)
+        size = torch.Size([world_model.latent_dim])
         self.observation_spec = Composite({LATENT: Unbounded(size, **like)})
         self.state_spec = Composite({LATENT: Unbounded(size, **like)})
-        self.action_spec = Bounded(-1.0, 1.0, shape=(world_model.action_dim,), **like)
-        self.reward_spec = Unbounded((1,), **like)
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([world_model.action_dim]), **like)
+        self.reward_spec = Unbounded(torch.Size([1]), **like)
 
     def device_and_dtype(self) -> tuple[torch.device, torch.dtype]:
         """Where observations and latents go now: those of the world model, which may have been moved or cast."""
         spec = self.observation_spec[LATENT]
-        return device_and_dtype(self.world_model, spec.device, spec.dtype)
+        return device_and_dtype(self.world_model, spec.device, spec.dtype)  # pyright: ignore[reportArgumentType]
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         """Starts from ``latent`` or encodes ``observation`` if given; from an all-zero observation otherwise."""

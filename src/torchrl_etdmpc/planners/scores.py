@@ -8,8 +8,8 @@ function has no such attribute and gets them all.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, get_args
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 from torch import Tensor, nn
 
@@ -20,6 +20,7 @@ ScoreName = Literal["final", "mean", "adaptive"]
 ScoreFunction = Callable[[Tensor], Tensor]
 
 
+@runtime_checkable
 class Score(Protocol):
     """Reduces a return table, and says how much of it the planner has to compute.
 
@@ -85,7 +86,7 @@ class FinalScore:
     """
 
     beta: float = 0.0
-    depths: ClassVar[Depths] = "last"
+    depths: Depths = field(default="last", init=False, repr=False)
 
     def __call__(self, returns: Tensor) -> Tensor:
         return lower_confidence_bound(returns[..., -1, :, :], self.beta)
@@ -104,7 +105,7 @@ class MeanScore:
     """
 
     beta: float = 0.0
-    depths: ClassVar[Depths] = "all"
+    depths: Depths = field(default="all", init=False, repr=False)
 
     def __call__(self, returns: Tensor) -> Tensor:
         return lower_confidence_bound(returns.mean(-3), self.beta)
@@ -126,7 +127,7 @@ class AdaptiveScore:
     """
 
     beta: float = 0.0
-    depths: ClassVar[Depths] = "all"
+    depths: Depths = field(default="all", init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.beta < 0:
@@ -159,7 +160,7 @@ def make_score(score: ScoreName | Score | ScoreFunction, beta: float = 0.0) -> S
     if callable(score):
         if beta:
             raise ValueError(f"beta={beta} has no effect on a score of your own; put the penalty into the callable.")
-        if not hasattr(score, "depths"):
+        if not isinstance(score, Score):
             return FunctionScore(score)
         if score.depths not in get_args(Depths):
             raise ValueError(f"depths of a score must be one of {', '.join(get_args(Depths))}, got {score.depths!r}.")

@@ -60,6 +60,9 @@ class ReanalyzeTransform(Transform):
     >>> reanalyze = ReanalyzeTransform(planner, slice_len=3, interval=10).attach(buffer)
     """
 
+    planner: nn.Module
+    replay_buffer: TensorDictReplayBuffer | None
+
     def __init__(
         self,
         planner: nn.Module,

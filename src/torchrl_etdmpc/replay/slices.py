@@ -120,9 +120,10 @@ class StepSliceSampler(Sampler):
         first, counts = self._starts(storage)
         total = int(counts.sum())
         if total == 0:
+            rows = len(storage)  # pyright: ignore[reportArgumentType]
             raise RuntimeError(
-                f"no trajectory in the buffer has {self.slice_len} steps yet ({len(storage)} rows); collect more "
-                "before sampling."
+                f"no trajectory in the buffer has {self.slice_len} steps yet ({rows} rows); collect more before "
+                "sampling."
             )
         start, stride, _, _ = self._segments.view()
         draws = torch.rand(2, batch_size // self.slice_len, dtype=torch.float64, generator=self._rng).numpy()

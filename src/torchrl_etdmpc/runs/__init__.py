@@ -2,7 +2,8 @@
 
 from torchrl_etdmpc.runs.directory import RunDirectory
 from torchrl_etdmpc.runs.errors import first_line
-from torchrl_etdmpc.runs.files import DamagedFileError
+from torchrl_etdmpc.runs.files import DamagedFileError, replacing
+from torchrl_etdmpc.runs.interval_means import IntervalMeans
 from torchrl_etdmpc.runs.log import COUNTER_COLUMNS, EVAL_COLUMNS, RunLog
 from torchrl_etdmpc.runs.loggers import LoggerName, make_logger, require_logger
 from torchrl_etdmpc.runs.progress_bar import ProgressBar, progress_bar
@@ -13,6 +14,7 @@ __all__ = [
     "COUNTER_COLUMNS",
     "EVAL_COLUMNS",
     "DamagedFileError",
+    "IntervalMeans",
     "LoggerName",
     "ProgressBar",
     "RunDirectory",
@@ -21,6 +23,7 @@ __all__ = [
     "library_versions",
     "make_logger",
     "progress_bar",
+    "replacing",
     "require_logger",
     "write_mp4",
 ]

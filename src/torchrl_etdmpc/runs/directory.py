@@ -113,8 +113,8 @@ class RunDirectory:
             raise
         self._write_config(text)
 
-    def go_on(self, config: Mapping[str, Any]) -> None:
-        """Locks the directory of a run that goes on, and stores the configuration if it changed (a longer budget).
+    def go_on(self) -> None:
+        """Locks the directory of a run that goes on.
 
         Raises:
             FileNotFoundError: if it holds no run.
@@ -122,8 +122,16 @@ class RunDirectory:
         """
         self.read_config()
         self._lock()
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Stores the configuration if it changed, e.g. to a longer budget.
+
+        Raises:
+            ValueError: if YAML cannot hold it.
+            OSError: if it cannot be written; the directory is closed.
+        """
         text = _to_yaml(config)
-        if text != self.config.read_text(encoding="utf-8"):
+        if not self.config.is_file() or text != self.config.read_text(encoding="utf-8"):
             self._write_config(text)
 
     def abandon(self) -> None:

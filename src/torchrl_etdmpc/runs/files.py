@@ -40,7 +40,7 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_whole(path: Path, content: bytes | str) -> str:
+def write_whole(path: Path, content: bytes | memoryview | str) -> str:
     """Writes a file that survives a power cut or is not there; returns its SHA-256."""
     data = content.encode() if isinstance(content, str) else content
     with replacing(path) as partial:

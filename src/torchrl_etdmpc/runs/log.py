@@ -187,7 +187,7 @@ class RunLog:
             )
         if self.logger is not None:
             shown = {f"{table}/{name}": value for name, value in row.items() if name != "env_steps"}
-            self.logger.log_metrics(shown, step=row["env_steps"])
+            self.logger.log_metrics(shown, step=int(row["env_steps"]))
 
 
 def _counters(env_steps: int, decision_steps: int, updates: int, wall_time_s: float) -> dict[str, float]:

@@ -59,7 +59,7 @@ def make_logger(name: LoggerName, directory: RunDirectory, config: Mapping[str, 
     if name == "tensorboard":
         folder = directory.tensorboard
         return get_logger("tensorboard", logger_name=str(folder.parent), experiment_name=folder.name)
-    import wandb
+    import wandb  # pyright: ignore[reportMissingImports]  # an extra
 
     if not directory.wandb_id.exists():
         write_whole(directory.wandb_id, secrets.token_hex(4))
@@ -73,6 +73,7 @@ def make_logger(name: LoggerName, directory: RunDirectory, config: Mapping[str, 
     def start() -> Logger:
         path = directory.path
         logger = get_logger("wandb", logger_name=str(path), experiment_name=path.name, wandb_kwargs=options)
+        assert logger is not None  # as the name is one of its own
         logger.log_hparams(dict(config))
         return logger
 

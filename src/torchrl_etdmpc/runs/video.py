@@ -64,7 +64,7 @@ def write_mp4(
         with replacing(path) as partial:
             partial.touch()  # ffmpeg's own error would not name the reason
             # Even sizes need no further alignment; a larger block would make ffmpeg rescale the picture.
-            writer = imageio_ffmpeg.write_frames(str(partial), (width, height), fps=float(fps), macro_block_size=2)
+            writer = imageio_ffmpeg.write_frames(str(partial), (width, height), fps=fps, macro_block_size=2)  # pyright: ignore[reportArgumentType]
             count = _send_all(writer, chain([first], iterator), height, width)
             _check_video(imageio_ffmpeg, partial, count)
     except OSError as error:

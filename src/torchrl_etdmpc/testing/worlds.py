@@ -241,6 +241,13 @@ class LQRWorld(AnalyticWorld):
     True
     """
 
+    transition_matrix: Tensor
+    control_matrix: Tensor
+    state_cost: Tensor
+    action_cost: Tensor
+    value_matrix: Tensor
+    gain: Tensor
+
     def __init__(
         self,
         transition_matrix: Tensor | None = None,

@@ -12,7 +12,7 @@ from torchrl_etdmpc.training.builders import (
 )
 from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, one_line_errors
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.evaluate import BarePolicy, EvaluationResult, Evaluator, evaluate
+from torchrl_etdmpc.training.evaluate import EvaluationResult, Evaluator
 from torchrl_etdmpc.training.launch import Launch, launch, plan_launch, read_run_config, resumed_config
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.presets import PRESETS, preset
@@ -25,7 +25,6 @@ __all__ = [
     "PRESETS",
     "Agent",
     "AgentFile",
-    "BarePolicy",
     "CheckpointError",
     "EvaluationResult",
     "Evaluator",
@@ -41,7 +40,6 @@ __all__ = [
     "build_reanalyze",
     "build_replay",
     "build_world_model",
-    "evaluate",
     "explicit_settings",
     "hydra_main",
     "launch",

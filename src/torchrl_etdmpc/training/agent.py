@@ -122,7 +122,7 @@ def build_agent(
     if discount is None:
         discount = discount_from_episode_length(task.decision_steps_per_episode)
     world_model = build_world_model(config.model, observation_dim, action_dim, terminates=task.terminates).to(device)
-    with named_settings("loss", config.loss):
+    with named_settings("loss", config.loss, scale_tau="tau"):
         loss = EfficientTDMPCLoss(
             world_model,
             discount=discount,

@@ -86,6 +86,8 @@ def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayB
     """Reanalyze attached to the buffer, or ``None`` if ``reanalyze.every`` is 0."""
     if config.reanalyze.every == 0:
         return None
+    # Departure from the thesis, which can be read as an interval of gradient updates: of decision steps, so that "UTD1
+    # every 10" and "UTD4 every 2" are proportional scaling.
     with named_settings("reanalyze", config.reanalyze):
         reanalyze = ReanalyzeTransform(
             agent.reanalyze_planner,

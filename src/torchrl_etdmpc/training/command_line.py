@@ -28,9 +28,9 @@ def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
         except Exception as error:
             if os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
                 raise
-            causes = [error]
-            while (causes[-1].__cause__ or causes[-1].__context__) is not None and _is_hydra(causes[-1]):
-                causes.append(causes[-1].__cause__ or causes[-1].__context__)
+            causes: list[BaseException] = [error]
+            while _is_hydra(causes[-1]) and (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
+                causes.append(cause)
             text = " ".join(" ".join(str(cause) for cause in causes).split())
             sys.exit(f"error: {text or type(error).__name__}")
 
@@ -75,9 +75,8 @@ def hydra_main(
             @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
             @one_line_errors  # inside as well: Hydra would add a line of its own to an exception that passes through it
             def run(values) -> None:
-                main(
-                    config_from_dict(config_class, OmegaConf.to_container(values, resolve=True, throw_on_missing=True))
-                )
+                plain: Any = OmegaConf.to_container(values, resolve=True, throw_on_missing=True)
+                main(config_from_dict(config_class, plain))
 
             run()
 

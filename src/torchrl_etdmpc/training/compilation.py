@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch.utils._pytree import tree_map_only
 
-_OPTIONS = {
+_OPTIONS: dict[str, Any] = {
     "fallback_random": True,  # PyTorch's own random numbers: those of an eager run, and faster on a CPU than Inductor's
     "cpp_wrapper": True,  # a hundred small operations are called from C++ and not from Python
 }

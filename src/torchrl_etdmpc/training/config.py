@@ -19,7 +19,7 @@ from torchrl_etdmpc.collectors.step import Insertion
 from torchrl_etdmpc.envs import Task, get_task
 from torchrl_etdmpc.modules.normed_linear import Activation
 from torchrl_etdmpc.objectives.policy import KLDirection
-from torchrl_etdmpc.planners.ensemble_mppi import FirstAction
+from torchrl_etdmpc.planners.ensemble_mppi import FirstAction, ScoringDtype
 from torchrl_etdmpc.planners.scores import ScoreName
 from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
@@ -66,7 +66,7 @@ class PlannerConfig:
     std_max: float = 2.0
     first_action: FirstAction = "elite"
     eval_first_action: FirstAction = "best"
-    scoring_dtype: str | None = None
+    scoring_dtype: ScoringDtype | None = None
     """``bfloat16`` rolls and scores candidates in half precision; learning with it is measured on walker-stand only.
     Default: the dtype of the weights."""
 
@@ -238,9 +238,11 @@ class TrainConfig:
     @functools.cached_property
     def task_spec(self) -> Task:
         """The task behind the name, with what this run changes about it."""
-        changes = {name: getattr(self, name) for name in ("action_repeat", "episode_length", "terminates")}
-        return dataclasses.replace(
-            get_task(self.task), **{name: value for name, value in changes.items() if value is not None}
+        return get_task(
+            self.task,
+            action_repeat=self.action_repeat,
+            episode_length=self.episode_length,
+            terminates=self.terminates,
         )
 
     @property
@@ -287,18 +289,20 @@ def arguments(group: Any, *without: str) -> dict[str, Any]:
 
 
 @contextmanager
-def named_settings(group: str, config: Any) -> Iterator[None]:
+def named_settings(group: str, config: Any, **renamed: str) -> Iterator[None]:
     """Names the setting in what a class says of its argument: ``horizon must ...`` becomes ``planner.horizon must``.
 
     Args:
         group (str): e.g. ``"planner"``.
         config (dataclass): the group.
+        **renamed (str): the setting behind an argument of another name.
     """
     try:
         yield
     except ValueError as error:
-        text = str(error)
-        raise ValueError(f"{group}{'.' if hasattr(config, text.split(' ')[0]) else ': '}{text}") from error
+        argument, _, rest = str(error).partition(" ")
+        setting = renamed.get(argument, argument)
+        raise ValueError(f"{group}{'.' if hasattr(config, setting) else ': '}{setting} {rest}") from error
 
 
 def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
@@ -318,7 +322,7 @@ def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> 
     converted = {}
     for name, value in values.items():
         hint = hints[name]
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, Mapping), f"{prefix}{name} must be a group of settings, got {value!r}.")
             converted[name] = config_from_dict(hint, value, f"{prefix}{name}.")
         else:
@@ -330,15 +334,17 @@ def _check_types(config: Any, prefix: str = "") -> None:
     """Checks what was not made by :func:`config_from_dict`."""
     for name, hint in typing.get_type_hints(type(config)).items():
         value = getattr(config, name)
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, hint), f"{prefix}{name} must be a {hint.__name__}, got {value!r}.")
             _check_types(value, f"{prefix}{name}.")
         else:
-            _convert(hint, value, f"{prefix}{name}")
+            meant = _convert(hint, value, f"{prefix}{name}")
+            same = type(meant) is type(value) or isinstance(meant, float)
+            _require(same, f"{prefix}{name} must be {meant!r}, got {value!r}.")
 
 
 def _convert(hint: Any, value: Any, name: str) -> Any:
-    if isinstance(hint, types.UnionType):
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):  # the latter with a Literal in it
         if value is None:
             return None
         hint = next(option for option in typing.get_args(hint) if option is not type(None))

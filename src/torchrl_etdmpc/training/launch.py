@@ -106,7 +106,10 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         stack.callback(eval_env.close, raise_if_closed=False)
         log = RunLog(directory, total_env_steps=config.total_env_steps)
         run = TrainingRun(config, env=env, eval_env=eval_env, log=log)  # before the directory: settings may be wrong
-        (directory.begin if plan.action == "begin" else directory.go_on)(config.to_dict())
+        if plan.action == "begin":
+            directory.begin(config.to_dict())
+        else:
+            directory.go_on()
         stack.callback(directory.close)
         stack.callback(log.close)
         try:
@@ -116,9 +119,11 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
                 directory.abandon()
             raise
         if plan.action == "resume":
-            run.resume()
+            run.resume()  # before anything of the run is changed: it may not be possible
         elif plan.action == "start over":
             log.start_over()
+        directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
+        directory.write_config(config.to_dict())
         summary = run.run()
     return (
         f"{config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "

@@ -12,6 +12,7 @@ from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.runs import IntervalMeans
 from torchrl_etdmpc.training.agent import build_agent
 from torchrl_etdmpc.training.builders import (
     build_collector,
@@ -21,7 +22,6 @@ from torchrl_etdmpc.training.builders import (
     row_bytes,
 )
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.interval_means import IntervalMeans
 
 
 class Learner:
@@ -46,7 +46,7 @@ class Learner:
         sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
         self.agent = build_agent(config, *sizes, device)
         self.replay = build_replay(config, device, sizes=sizes)
-        rows, where = self.replay.storage.max_size, self.replay.storage.device
+        rows, where = self.replay.storage.max_size, getattr(self.replay.storage, "device", "cpu")
         torchrl_logger.info(f"replay: {rows:,} rows, {rows * row_bytes(*sizes) / 1e6:,.0f} MB when full, on {where}")
         self.reanalyze = build_reanalyze(config, self.agent, self.replay)
         self.collector = build_collector(config, self.agent, env, self.replay)
@@ -90,7 +90,7 @@ class Learner:
         if not done.any():
             return
         self.faults_in_a_row = 0
-        for episode_return in stepped["next", "episode_reward"][done].unbind():
+        for episode_return in stepped["next", "episode_reward"][done].unbind(0):
             self._decisions.add({"episode_return": episode_return})
         if stepped["next", "terminated"].any() and not self.config.task_spec.terminates:
             raise ValueError(

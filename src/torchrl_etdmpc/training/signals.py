@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from types import FrameType, TracebackType
+from typing import Any
 
 from torchrl import torchrl_logger
 
@@ -31,7 +32,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.requested = False
         self.nothing_to_save = False
-        self._before: dict[int, object] = {}
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():

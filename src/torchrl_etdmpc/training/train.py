@@ -21,7 +21,7 @@ from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.evaluate import Evaluator
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.precompile import precompile
-from torchrl_etdmpc.training.run_state import RunState
+from torchrl_etdmpc.training.run_state import Duty, RunState
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 
 
@@ -79,7 +79,7 @@ class TrainingRun:
         """Environment steps so far, action repeats counted."""
         return self.learner.env_steps
 
-    def counters(self) -> dict[str, int | float]:
+    def counters(self) -> dict[str, Any]:
         """The columns that every file of the run counts by."""
         return {
             "env_steps": self.env_steps,
@@ -164,8 +164,12 @@ class TrainingRun:
 
     def _note_duties(self) -> None:
         config, last = self.config, self.env_steps >= self.config.total_env_steps
-        due = {"train_row": config.log_every, "evaluation": config.eval_every, "checkpoint": config.checkpoint_every}
-        self.state.due += [duty for duty, interval in due.items() if last or self.learner.passed(interval)]
+        intervals: dict[Duty, int] = {
+            "train_row": config.log_every,
+            "evaluation": config.eval_every,
+            "checkpoint": config.checkpoint_every,
+        }
+        self.state.due.extend(duty for duty, interval in intervals.items() if last or self.learner.passed(interval))
 
     def _after_work(self) -> None:
         """Does what is due, and stops here if that was asked for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -130,7 +131,8 @@ class Updater:
         for part, gradient in gradients.items():
             self._flat[part].grad = gradient
         # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
-        self.optimizer.grad_scale, self.optimizer.found_inf = None, skip
+        self.optimizer.grad_scale = None  # pyright: ignore[reportAttributeAccessIssue]
+        self.optimizer.found_inf = skip  # pyright: ignore[reportAttributeAccessIssue]
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.skipped += skip.long()
@@ -161,14 +163,16 @@ class Updater:
         self._compiled = None
 
     def _gradients(
-        self, slices: Slices, target_values: dict[str, Tensor]
+        self, slices: Slices, target_values: dict[str, Tensor] | None
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
         """Losses and metrics, the clipped gradient of the summed losses in the layout of each part, and 1.0 to skip.
 
         All of it is one graph when it is compiled, so nothing here may wait for the device or depend on a value.
         """
+        # Departure from BMPC and TD-MPC2, which make two backward passes, the model's and then the policy's: neither
+        # loss sends a gradient into what the other one trains, so the gradient of the sum is both.
         out = self.loss.evaluate(slices, target_values)
-        total = sum(value for key, value in out.items() if key.startswith("loss_"))
+        total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
         clipped = {"model": ("encoder", "heads", "values")} | ({"policy": ("policy",)} if self.loss.distill else {})
         gradients = self._flat_gradients(total, [part for names in clipped.values() for part in names])
@@ -197,13 +201,13 @@ class Updater:
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
 
 
-def _joined(tensors: list[Tensor]) -> Tensor:
+def _joined(tensors: Sequence[Tensor]) -> Tensor:
     """The tensors end to end, zeros between them, as :func:`_moved_together` lays them out."""
     return torch.cat([nn.functional.pad(t.flatten(), (0, -t.numel() % _ALIGNMENT)) for t in tensors])
 
 
 @torch.no_grad()
-def _moved_together(tensors: list[Tensor]) -> Tensor:
+def _moved_together(tensors: Sequence[Tensor]) -> Tensor:
     """Moves tensors into one new piece of memory, of which each becomes a view."""
     flat, begin = _joined(tensors), 0
     for tensor in tensors:

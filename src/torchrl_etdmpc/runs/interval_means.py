@@ -31,7 +31,8 @@ class IntervalMeans:
         """
         names = tuple(values)
         row = torch.stack([value.detach().reshape(()) for value in values.values()]).double()
-        self._sums[names] = self._sums[names] + row if names in self._sums else row
+        total = self._sums.get(names)
+        self._sums[names] = row if total is None else total.to(row.device) + row  # restored sums are on the CPU
         self._counts[names] = self._counts.get(names, 0) + 1
 
     def means(self) -> dict[str, float]:

@@ -1,0 +1,76 @@
+"""Returns of whole episodes, without exploration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase, ExplorationType
+from torchrl.envs.utils import set_exploration_type
+
+
+@torch.no_grad()
+def evaluate(
+    env: EnvBase,
+    policy: nn.Module,
+    *,
+    episodes: int,
+    policy_device: torch.device | str | None = None,
+    on_step: Callable[[TensorDictBase], None] | None = None,
+) -> Tensor:
+    """Undiscounted returns of whole episodes, acting without exploration noise.
+
+    A batched environment runs its episodes side by side: one planning call per step serves all of them.
+
+    Args:
+        env (EnvBase): batch size [] or [n]; reset at the start.
+        policy (nn.Module): TensorDict module that writes the action; a warm start it carries must be in the
+            environment's specs (``env.append_transform(planner.make_tensordict_primer())``).
+        episodes (int): how many episodes. With n environments they run in rounds of n.
+        policy_device (torch.device, optional): where the policy's inputs go. Default: the environment's device.
+        on_step (callable, optional): called with the tensordict of every step, e.g. to render a frame.
+
+    Returns:
+        Tensor: the return of each episode, shape ``[episodes]``.
+
+    Raises:
+        ValueError: if ``episodes`` is not positive.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+    num_envs = max(env.batch_size.numel(), 1)
+    if policy_device is not None and torch.device(policy_device) == env.device:
+        policy_device = None
+    returns: list[Tensor] = []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        while len(returns) * num_envs < episodes:
+            returns.append(_round(env, policy, num_envs, policy_device, on_step))
+    return torch.cat(returns)[:episodes]
+
+
+def _round(
+    env: EnvBase,
+    policy: nn.Module,
+    num_envs: int,
+    policy_device: torch.device | str | None,
+    on_step: Callable[[TensorDictBase], None] | None,
+) -> Tensor:
+    """The first episode of every environment."""
+    tensordict = env.reset()
+    total = torch.zeros(num_envs)
+    running = torch.ones(num_envs, dtype=torch.bool)
+    while running.any():
+        if policy_device is None:
+            tensordict = policy(tensordict)
+        else:
+            inputs = tensordict.select(*policy.in_keys, strict=False).to(policy_device)
+            outputs = policy(inputs).select(*policy.out_keys, strict=False)
+            tensordict = tensordict.update(outputs.to(env.device or "cpu"))
+        stepped, tensordict = env.step_and_maybe_reset(tensordict)
+        total += torch.where(running, stepped.get(("next", "reward")).reshape(num_envs).cpu(), 0)
+        running &= ~stepped.get(("next", "done")).reshape(num_envs).cpu()
+        if on_step is not None:
+            on_step(stepped)
+    return total

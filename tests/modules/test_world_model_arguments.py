@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import pytest
+from torch import nn
+
+from torchrl_etdmpc import functional
+from torchrl_etdmpc.modules import WorldModel
+
+O, A, L = 5, 2, 16  # noqa: E741
+
+
+@pytest.mark.parametrize(("latent_dim", "nearest"), [(500, 496), (510, 512), (3, 8), (9, 8)])
+def test_a_latent_size_that_simnorm_cannot_split_is_refused_with_the_nearest_multiple(latent_dim, nearest):
+    with pytest.raises(ValueError) as error:
+        WorldModel(O, A, latent_dim=latent_dim)
+    assert str(error.value) == (
+        f"latent_dim must be a multiple of simnorm_dim=8, got {latent_dim}; the nearest is {nearest}."
+    )
+
+
+@pytest.mark.parametrize("size", [0, -3])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "observation_dim",
+        "action_dim",
+        "latent_dim",
+        "mlp_dim",
+        "encoder_dim",
+        "encoder_layers",
+        "num_dynamics",
+        "num_values",
+        "simnorm_dim",
+    ],
+)
+def test_a_size_below_one_is_refused_by_name(name, size):
+    with pytest.raises(ValueError, match=rf"^{name} must be at least 1, got {size}\.$"):
+        WorldModel(**{"observation_dim": O, "action_dim": A, name: size})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_bins": 1}, r"num_bins must be at least 2, got 1\."),
+        ({"bin_min": 3.0, "bin_max": 3.0}, r"bin_min must be below bin_max=3\.0, got 3\.0\."),
+        ({"bin_min": 10.5}, r"bin_min must be below bin_max=10\.0, got 10\.5\."),
+        ({"log_std_min": 1.0}, r"log_std_min must be below log_std_max=1\.0, got 1\.0\."),
+        ({"log_std_max": -4.0}, r"log_std_min must be below log_std_max=-4\.0, got -3\.0\."),
+        ({"dropout": 1.0}, r"dropout must be in \[0, 1\), got 1\.0\."),
+        ({"dropout": -0.1}, r"dropout must be in \[0, 1\), got -0\.1\."),
+    ],
+    ids=str,
+)
+def test_bins_bounds_and_rates_out_of_range_are_refused(options, message, build):
+    with pytest.raises(ValueError, match=rf"^{message}$"):
+        build(**options)
+
+
+def test_an_unknown_activation_is_refused_with_the_choices(build):
+    with pytest.raises(ValueError, match=r"^activation must be one of mish, silu, relu, got 'gelu'\.$"):
+        build(activation="gelu")
+
+
+def test_the_activation_reaches_every_network(build):
+    mish, relu = build(termination=True), build(termination=True, activation="relu")
+    relu.load_state_dict(mish.state_dict())
+    networks = [name for name, _ in mish.named_children()]
+    assert networks == ["encoder", "dynamics", "reward_head", "value_head", "policy", "termination_head"]
+    for name in networks:
+        activations = [{layer.activation for layer in getattr(m, name).hidden} for m in (mish, relu)]
+        assert activations == [{functional.mish}, {nn.functional.relu}], name

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import LazyStackedTensorDict
+
+
+def test_a_memory_mapped_batch_gives_the_same_numbers(loss, slices, run_seeded, assert_same_output, tmp_path):
+    expected = run_seeded(loss.eval(), slices)
+    mapped = slices.memmap(tmp_path)
+    assert mapped.is_memmap()
+    assert_same_output(run_seeded(loss, mapped), expected)
+
+
+@pytest.mark.parametrize("stack_dim", [0, 1])
+def test_a_lazily_stacked_batch_gives_the_same_numbers(loss, slices, run_seeded, assert_same_output, stack_dim):
+    expected = run_seeded(loss.eval(), slices)
+    lazy = LazyStackedTensorDict(*slices.unbind(stack_dim), stack_dim=stack_dim)
+    assert lazy.batch_size == (4, 3)
+    assert_same_output(run_seeded(loss, lazy), expected)
+
+
+@pytest.mark.parametrize(("num_slices", "slice_len"), [(4, 1), (1, 3), (1, 1)])
+@pytest.mark.parametrize("heads", [1, 2])
+def test_single_heads_slices_and_steps_are_ordinary_sizes(
+    make_loss, make_world_model, make_slices, run_seeded, num_slices, slice_len, heads, total, terms_of
+):
+    world_model = make_world_model(num_dynamics=heads, num_values=heads, termination=True)
+    loss = make_loss("whole", world_model, reduction="none")
+    out = run_seeded(loss, make_slices(num_slices, slice_len))
+    for term in terms_of["whole"]:
+        assert out[f"loss_{term}"].shape == (num_slices, slice_len)
+        assert out[f"loss_{term}"].isfinite().all()
+    total(out).sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
+
+
+@pytest.mark.usefixtures("double_precision")
+@pytest.mark.parametrize(("num_dynamics", "num_values"), [(1, 1), (1, 2), (3, 1)])
+@pytest.mark.parametrize("slice_len", [1, 3])
+def test_the_plain_reference_holds_for_other_numbers_of_heads_and_steps(
+    make_loss, make_world_model, make_slices, run_seeded, plain_errors, depth_mean, num_dynamics, num_values, slice_len
+):
+    world_model = make_world_model(num_dynamics=num_dynamics, num_values=num_values)
+    loss = make_loss("whole", world_model, entropy_coef=0.1).eval()
+    slices = make_slices(slice_len=slice_len)
+    torch.manual_seed(7)
+    errors = plain_errors(loss, slices, torch.randn_like(slices["action"].transpose(0, 1)))
+    out = run_seeded(loss, slices)
+    torch.testing.assert_close(out["loss_consistency"], 20 * depth_mean(errors["consistency"]))
+    torch.testing.assert_close(out["loss_reward"], 0.1 * depth_mean(errors["reward"]))
+    torch.testing.assert_close(out["loss_value"], 0.1 * depth_mean(errors["value"]))
+    torch.testing.assert_close(out["loss_policy"], depth_mean(errors["kl"] - 0.1 * 3 * errors["entropy"]))
+
+
+# tensordict reads a switch that torch deprecates
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+def test_the_compiled_loss_equals_the_eager_one_in_numbers_gradients_and_scale(
+    make_loss, make_world_model, slices, run_seeded, assert_same_output, gradients, assert_same_gradients, total
+):
+    world_model = make_world_model(termination=True, dropout=0.0)
+    loss = make_loss("whole", world_model, scale_tau=0.5)
+    torch.compiler.reset()
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    for seed in (1, 2):  # the scale moves in between
+        loss.kl_scale.fill_(1.0 + seed)
+        expected = run_seeded(loss, slices, seed=seed)
+        loss.kl_scale.fill_(1.0 + seed)
+        actual = run_seeded(compiled, slices, seed=seed)
+        assert_same_output(actual, expected)
+        assert actual["kl_scale"] == loss.kl_scale != 1.0 + seed
+        expected, actual = gradients(total(expected), world_model), gradients(total(actual), world_model)
+        assert_same_gradients(actual, expected)

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import copy
+import warnings
+
+import pytest
+import torch
+
+
+@pytest.mark.parametrize("kind", ["whole", "value"])
+def test_the_discount_can_be_assigned_in_place_and_takes_effect(make_loss, slices, run_seeded, kind):
+    loss = make_loss(kind).eval()
+    buffer = loss.discount
+    targets = []
+    for discount in (0.0, 0.5, 1.0):
+        loss.discount = discount
+        targets.append(run_seeded(loss, slices)["value_target"])
+    assert loss.discount is buffer
+    torch.testing.assert_close(targets[1], (targets[0] + targets[2]) / 2)
+    assert targets[0] != targets[2]
+
+
+@pytest.mark.parametrize("kind", ["whole", "policy"])
+def test_the_entropy_coefficient_can_be_assigned_in_place_and_takes_effect(make_loss, slices, kind):
+    loss = make_loss(kind, rho=1.0).eval()
+    buffer = loss.entropy_coef
+    loss.entropy_coef = 0.0
+    none = loss(slices)
+    loss.entropy_coef = 0.5
+    torch.testing.assert_close(loss(slices)["loss_policy"], none["loss_policy"] - 0.5 * 3 * none["policy_entropy"])
+    assert loss.entropy_coef is buffer
+
+
+def test_the_default_coefficients_are_the_papers(make_loss, world_model):
+    loss = make_loss("whole", world_model)
+    defaults = {"consistency": 20.0, "reward": 0.1, "value": 0.1, "termination": 1.0, "policy": 1.0, "entropy": 1e-4}
+    for name, value in defaults.items():
+        assert getattr(loss, f"{name}_coef").item() == pytest.approx(value)
+    assert loss.rho == 0.5
+
+
+@pytest.mark.parametrize("kind", ["whole", "value"])
+def test_a_loss_with_targets_warns_while_no_updater_is_associated(make_loss, slices, kind):
+    with pytest.warns(UserWarning, match="No target network updater has been associated"):
+        make_loss(kind, updater=False)(slices)
+
+
+def test_no_warning_is_raised_by_building_calling_saving_or_copying(
+    make_loss, make_world_model, kind, slices, total, keywords_of
+):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss = make_loss(kind, make_world_model(termination=True))
+        for _ in range(2):
+            total(loss(slices)).backward()
+        loss.load_state_dict(loss.state_dict())
+        loss.set_keys(observation=None)
+        copy.deepcopy(loss).double()
+        loss.reset_parameters_recursive()
+        loss.train().eval()
+        loss(**keywords_of(kind, slices))
+
+
+def test_a_flat_batch_is_answered_with_the_reshape_that_it_needs(loss, slices):
+    with pytest.raises(
+        ValueError, match=r"needs a batch of slices \[B, T\].*\[12, 5\].*sample.reshape\(-1, slice_len\)"
+    ):
+        loss(slices.reshape(-1))
+    with pytest.raises(ValueError, match=r"needs a batch of slices \[B, T\].*\[3, 5\]"):
+        loss(slices[0])
+    with pytest.raises(ValueError, match=r"needs a batch of slices \[B, T\].*\[1, 4, 3, 5\]"):
+        loss(slices[None])
+
+
+def test_a_reward_without_its_trailing_dimension_is_refused(make_loss, slices):
+    slices["next", "reward"] = slices["next", "reward"].squeeze(-1)
+    with pytest.raises(ValueError, match=r"features\], got \('next', 'reward'\) of shape \[4, 3\]"):
+        make_loss("model")(slices)
+
+
+def test_a_missing_key_is_named_together_with_the_way_to_rename_it(make_loss, slices):
+    with pytest.raises(KeyError, match=r"needs the key \('next', 'observation'\).*set_keys\(observation="):
+        make_loss("model")(slices.exclude(("next", "observation")))
+    with pytest.raises(KeyError, match=r"needs the key \('plan', 'scale'\).*set_keys\(plan_scale="):
+        make_loss("policy")(slices.exclude(("plan", "scale")))
+
+
+@pytest.mark.parametrize(
+    ("kinds", "option", "value", "message"),
+    [
+        (
+            "whole model value policy",
+            "reduction",
+            "average",
+            "reduction must be one of none, mean, sum, got 'average'",
+        ),
+        ("whole model value policy", "rho", 0.0, r"rho must be in \(0, 1\], got 0.0"),
+        ("whole model value policy", "rho", 1.1, r"rho must be in \(0, 1\], got 1.1"),
+        ("whole model value policy", "rho", float("nan"), r"rho must be in \(0, 1\], got nan"),
+        ("whole value", "discount", 0.0, r"discount must be in \(0, 1\], got 0.0; see discount_from_episode_length"),
+        ("whole value", "discount", 1.1, r"discount must be in \(0, 1\], got 1.1"),
+        ("whole policy", "scale_tau", -0.1, r"scale_tau must be in \[0, 1\], got -0.1"),
+        ("whole policy", "scale_tau", 1.1, r"scale_tau must be in \[0, 1\], got 1.1"),
+        ("whole policy", "kl_direction", "up", "kl_direction must be one of backward, forward, got 'up'"),
+    ],
+)
+def test_an_option_out_of_range_is_refused_by_name(make_loss, kinds, option, value, message):
+    for kind in kinds.split():
+        with pytest.raises(ValueError, match=message):
+            make_loss(kind, **{option: value})
+
+
+def test_the_ends_of_the_ranges_are_accepted(make_loss, slices, total):
+    for options in ({"rho": 1.0, "discount": 1.0, "scale_tau": 0.0}, {"scale_tau": 1.0}):
+        assert total(make_loss("whole", **options)(slices)).isfinite()

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from torchrl.objectives import SoftUpdate
+
+
+def _identities(module):
+    return {id(parameter) for parameter in module.parameters()}
+
+
+def test_reset_parameters_recursive_draws_new_weights_for_the_networks_that_are_trained(
+    loss, kind, world_model, networks, owned
+):
+    before = {}
+    for name, network in networks(world_model).items():
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.add_(1000.0)
+        before[name] = [(parameter, parameter.clone()) for parameter in network.parameters()]
+    loss.reset_parameters_recursive()
+    for name, network in networks(world_model).items():
+        for (parameter, value), now in zip(before[name], network.parameters(), strict=True):
+            assert parameter is now
+            if name in owned(kind):
+                assert (now.abs() < 10).all()
+            else:
+                assert torch.equal(now, value)
+    if "value" in owned(kind):
+        for key, parameter in loss.value_params.items(True, True):
+            assert torch.equal(loss.target_value_params[key], parameter)
+            assert loss.target_value_params[key].data_ptr() != parameter.data_ptr()
+    if "dynamics" in owned(kind):
+        first, second = world_model.dynamics.hidden[0].weight
+        assert first.any() and not torch.equal(first, second)
+
+
+def test_a_reset_of_the_whole_starts_the_count_of_updates_anew(make_loss):
+    for kind, version in (("whole", 0), ("policy", 5)):
+        loss = make_loss(kind)
+        loss.world_model.version.fill_(5)
+        loss.reset_parameters_recursive()
+        assert loss.world_model.version == version
+
+
+def test_the_parameters_are_the_trained_networks_own_and_targets_add_none(loss, kind, world_model, networks, owned):
+    own = [network for name, network in networks(world_model).items() if name in owned(kind)]
+    assert _identities(loss) == set.union(*(_identities(network) for network in own))
+    assert len(list(loss.parameters())) == sum(len(list(network.parameters())) for network in own)
+    if kind == "whole":
+        assert _identities(loss) == _identities(world_model)
+
+
+@pytest.mark.parametrize("called_before", [False, True])
+def test_a_cast_keeps_the_networks_shared_and_takes_everything_along(
+    loss, kind, world_model, networks, slices, called_before, total
+):
+    if called_before:
+        loss(slices)
+    shared = _identities(loss)
+    for cast in (loss.double, lambda: loss.to("cpu"), loss.float, lambda: loss.to(torch.float64)):
+        assert cast() is loss
+        assert _identities(loss) == shared
+        assert shared <= _identities(world_model)
+    assert {parameter.dtype for parameter in world_model.parameters()} == {torch.float64}
+    assert world_model.bins.dtype == torch.float64
+    assert world_model.version.dtype == torch.int64
+    assert {buffer.dtype for buffer in loss.buffers()} == {torch.float64}
+    out = loss(slices.to(torch.float64))
+    assert {value.dtype for value in out.values()} == {torch.float64}
+    total(out).backward()
+    assert all(parameter.grad.dtype == torch.float64 for parameter in loss.parameters())
+
+
+def test_the_updater_still_works_after_calls_and_a_cast(make_loss, slices):
+    loss = make_loss("whole", updater=False)
+    updater = SoftUpdate(loss, tau=0.1)
+    loss(slices)
+    loss.double()
+    loss(slices.to(torch.float64))
+    with torch.no_grad():
+        loss.world_model.value_head.output.bias.add_(1.0)
+    before = loss.target_value_params["output", "bias"].clone()
+    updater.step()
+    torch.testing.assert_close(loss.target_value_params["output", "bias"], before + 0.1)
+
+
+def test_an_optimizer_step_on_the_loss_is_seen_by_the_world_model(
+    loss, kind, world_model, networks, slices, total, owned
+):
+    before = {name: [p.clone() for p in network.parameters()] for name, network in networks(world_model).items()}
+    optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
+    total(loss(slices)).backward()
+    optimizer.step()
+    for name, network in networks(world_model).items():
+        for value, now in zip(before[name], network.parameters(), strict=True):
+            assert torch.equal(value, now) == (name not in owned(kind))
+
+
+def test_a_state_dict_carries_weights_targets_and_the_scale_to_a_fresh_loss(
+    make_loss, make_world_model, kind, slices, run_seeded, assert_same_output, owned
+):
+    trained = make_loss(kind, make_world_model(termination=True))
+    if kind in ("whole", "policy"):
+        trained.scale_tau = 1.0
+    trained(slices)
+    fresh = make_loss(kind, make_world_model(termination=True))
+    others = [network for network in ("reward_head", "termination_head", "policy", "encoder", "dynamics")]
+    for name in others:  # what a part does not own is not in its state
+        if name.removesuffix("_head") not in owned(kind):
+            getattr(fresh.world_model, name).load_state_dict(getattr(trained.world_model, name).state_dict())
+    assert not (run_seeded(fresh.eval(), slices) == run_seeded(trained.eval(), slices)).any()
+    state = copy.deepcopy(trained.state_dict())
+    keys = fresh.load_state_dict(state)
+    assert not keys.missing_keys and not keys.unexpected_keys
+    assert_same_output(run_seeded(fresh.eval(), slices), run_seeded(trained.eval(), slices), rtol=0, atol=0)
+    if kind in ("whole", "value"):
+        target, online = fresh.target_value_params["output", "weight"], fresh.value_params["output", "weight"]
+        assert torch.equal(target, trained.target_value_params["output", "weight"])
+        assert not torch.equal(target, online)
+    if kind in ("whole", "policy"):
+        assert fresh.kl_scale == trained.kl_scale > 1
+    assert _identities(fresh) <= _identities(fresh.world_model)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
+@pytest.mark.parametrize("called_before", [False, True])
+def test_a_copy_gives_the_same_numbers_and_trains_its_own_world_model(
+    loss, slices, run_seeded, assert_same_output, duplicate, called_before, total
+):
+    if called_before:
+        loss(slices)
+    twin = duplicate(loss)
+    assert not _identities(twin) & _identities(loss)
+    assert _identities(twin) <= _identities(twin.world_model)
+    assert_same_output(run_seeded(twin.eval(), slices), run_seeded(loss.eval(), slices), rtol=0, atol=0)
+    total(twin(slices)).backward()
+    assert all(parameter.grad is not None for parameter in twin.parameters())
+    assert all(parameter.grad is None for parameter in loss.parameters())
+
+
+def test_copying_a_loss_together_with_its_world_model_keeps_them_shared(loss, world_model):
+    world_model_twin, twin = copy.deepcopy((world_model, loss))
+    assert twin.world_model is world_model_twin
+    assert _identities(twin) <= _identities(world_model_twin)

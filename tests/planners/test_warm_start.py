@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_etdmpc import Plan
+
+_WARNING = (
+    "^'plan_mean' is not in the planner's input, so every plan starts cold; append planner.make_tensordict_primer"
+)
+
+
+def run(planner, tensordict, *, seed: int = 0):
+    """The planner's output on a copy of the input, with seeded noise."""
+    torch.manual_seed(seed)
+    return planner(tensordict.clone())
+
+
+def expected_plan(planner, observation, carried, *, seed: int = 0) -> Plan:
+    """The same from ``plan``."""
+    torch.manual_seed(seed)
+    return planner.plan(observation, carried, explore=False, noise=planner.draw_noise(len(observation)))
+
+
+def test_the_first_candidates_are_drawn_around_the_shifted_previous_plan(make_planner, states):
+    planner = make_planner(warm_start=True)
+    previous = torch.rand(2, 3, 2, dtype=torch.float64) * 2 - 1
+    noise = planner.draw_noise(2)
+    trace = planner.plan(states(2), previous, noise=noise, trace=True).trace
+    shifted = torch.cat([previous[:, 1:], torch.zeros(2, 1, 2)], dim=1)
+    drawn = (shifted[:, None] + 2.0 * noise.candidates[:, 0]).clamp(-1, 1)
+    torch.testing.assert_close(trace.actions[:, 0, 5:], drawn)
+
+
+def test_the_carried_plan_is_the_mean_of_the_last_iteration(make_planner, states):
+    plan = make_planner().plan(states(2), trace=True)
+    assert torch.equal(plan.mean, plan.trace.mean[:, -1])
+
+
+def test_the_start_of_an_episode_zeroes_that_environments_plan_only(make_planner, states, run, expected_plan):
+    planner, observation = make_planner(warm_start=True), states(3)
+    carried = torch.rand(3, 3, 2, dtype=torch.float64)
+    is_init = torch.tensor([[False], [True], [False]])
+    td = TensorDict({"observation": observation, "plan_mean": carried, "is_init": is_init}, batch_size=[3])
+    expected = expected_plan(planner, observation, carried * torch.tensor([1.0, 0.0, 1.0])[:, None, None])
+    out = run(planner, td)
+    torch.testing.assert_close(out["plan", "loc"], expected.loc)
+    torch.testing.assert_close(out["next", "plan_mean"], expected.mean)
+    # Every part of it matters: the plan is another one with other starts.
+    for other in (carried, torch.zeros_like(carried)):
+        assert not torch.allclose(expected_plan(planner, observation, other).mean, expected.mean)
+
+
+def test_a_carried_plan_needs_no_episode_flag(make_planner, states, run, expected_plan):
+    planner, observation = make_planner(warm_start=True), states(2)
+    carried = torch.rand(2, 3, 2, dtype=torch.float64)
+    out = run(planner, TensorDict({"observation": observation, "plan_mean": carried}, batch_size=[2]))
+    torch.testing.assert_close(out["next", "plan_mean"], expected_plan(planner, observation, carried).mean)
+
+
+def test_an_episode_flag_alone_starts_cold_and_carries_on(make_planner, states, run, expected_plan):
+    planner, observation = make_planner(warm_start=True), states(2)
+    td = TensorDict({"observation": observation, "is_init": torch.ones(2, 1, dtype=torch.bool)}, batch_size=[2])
+    out = run(planner, td)
+    torch.testing.assert_close(out["next", "plan_mean"], expected_plan(planner, observation, None).mean)
+
+
+def test_a_plan_that_was_lost_within_an_episode_is_warned_of_once(make_planner, states, run, expected_plan):
+    planner, observation = make_planner(warm_start=True), states(2)
+    td = TensorDict({"observation": observation, "is_init": torch.tensor([[True], [False]])}, batch_size=[2])
+    with pytest.warns(UserWarning, match=_WARNING):
+        run(planner, td)
+    out = run(planner, td)  # warnings are errors here
+    torch.testing.assert_close(out["next", "plan_mean"], expected_plan(planner, observation, None).mean)
+
+
+def test_with_neither_key_every_plan_is_cold_and_the_planner_warns_once(make_planner, states, run, expected_plan):
+    planner, observation = make_planner(warm_start=True), states(2)
+    td = TensorDict({"observation": observation}, batch_size=[2])
+    with pytest.warns(UserWarning, match=_WARNING):
+        out = run(planner, td)
+    for _ in range(2):
+        torch.testing.assert_close(out["plan", "loc"], expected_plan(planner, observation, None).loc)
+        assert ("next", "plan_mean") not in out.keys(True)
+        out = run(planner, td)  # warnings are errors here
+
+
+def test_without_warm_start_nothing_is_read_written_or_warned_of(make_planner, states, run, expected_plan):
+    planner, observation = make_planner(), states(2)
+    carried = torch.rand(2, 3, 2, dtype=torch.float64)
+    td = TensorDict({"observation": observation, "plan_mean": carried}, batch_size=[2])
+    out = run(planner, td)
+    torch.testing.assert_close(out["plan", "loc"], expected_plan(planner, observation, None).loc)
+    assert "next" not in out.keys()
+    assert planner.in_keys == ["observation"]
+
+
+def test_the_planner_keeps_nothing_from_call_to_call(make_planner, states, run):
+    planner = make_planner(warm_start=True)
+    td, other = (
+        TensorDict({"observation": states(2), "plan_mean": torch.rand(2, 3, 2).double()}, batch_size=[2])
+        for _ in range(2)
+    )
+    first = run(planner, td)
+    run(planner, other, seed=1)
+    assert (run(planner, td) == first).all()
+
+
+def test_the_primer_describes_the_warm_start(make_planner):
+    primer = make_planner(horizon=4, plan_mean_key=("agent", "carried")).make_tensordict_primer()
+    assert primer.primers["agent", "carried"].shape == (4, 2)

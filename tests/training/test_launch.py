@@ -1,0 +1,361 @@
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import signal
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
+from torchrl_etdmpc.collectors import StepCollector
+from torchrl_etdmpc.envs import Task, register_task
+from torchrl_etdmpc.runs import RunDirectory, RunLog
+from torchrl_etdmpc.training import (
+    RunInterrupted,
+    TrainConfig,
+    TrainingRun,
+    launch,
+    plan_launch,
+    read_run_config,
+    resumed_config,
+)
+
+EPISODE = 20  # decisions
+
+
+@pytest.fixture
+def command(tmp_path, tiny_config) -> Callable[..., TrainConfig]:
+    """The configuration of a command, in a directory that is not there yet."""
+
+    def make(**changes: Any) -> TrainConfig:
+        given = {"run_dir": str(tmp_path / "runs" / "run"), "episode_length": 2 * EPISODE, "eval_every": 100}
+        return tiny_config(**(given | changes))
+
+    return make
+
+
+def begin(config: TrainConfig) -> RunDirectory:
+    directory = RunDirectory(config.run_dir)
+    directory.begin(config.to_dict())
+    directory.close()
+    return directory
+
+
+def save(directory: RunDirectory) -> None:
+    CheckpointStore(directory.checkpoints).save(80, {}, TensorDictReplayBuffer(storage=LazyTensorStorage(10)))
+
+
+def finish(directory: RunDirectory, config: TrainConfig) -> None:
+    RunLog(directory, total_env_steps=config.total_env_steps).finish({"env_steps": config.total_env_steps})
+
+
+def plan(config: TrainConfig, *explicit: str) -> tuple[str, TrainConfig]:
+    """Action and configuration of a plan, which changed nothing."""
+    run_dir = Path(config.run_dir)
+    before = {path: path.stat().st_mtime_ns for path in (run_dir.parent, *run_dir.rglob("*")) if path.exists()}
+    try:
+        found = plan_launch(config, explicit)
+    finally:
+        assert {path: path.stat().st_mtime_ns for path in before} == before
+        assert len(list(run_dir.rglob("*"))) == len([path for path in before if path != run_dir.parent])
+    assert found.directory.path == run_dir
+    return found.action, found.config
+
+
+@pytest.mark.parametrize("resume", ["off", "auto"])
+def test_where_there_is_nothing_a_new_run_begins(command, resume):
+    config = command(resume=resume)
+    assert plan(config) == ("begin", config)
+
+
+def test_going_on_where_there_is_nothing_is_refused(command):
+    with pytest.raises(FileNotFoundError, match=r"^run_dir=.*run holds no run to go on with; start it with resume=off"):
+        plan(command(resume="on"))
+
+
+@pytest.mark.parametrize("state", ["begun", "saved", "finished"])
+def test_a_run_that_is_there_is_never_written_over(command, state):
+    directory = begin(command())
+    if state != "begun":
+        save(directory)
+    if state == "finished":
+        finish(directory, command())
+    with pytest.raises(FileExistsError, match=r"^run_dir=.* already holds a run; choose another run_dir or remove it"):
+        plan(command(resume="off"))
+
+
+@pytest.mark.parametrize("file", ["train", "eval", "summary"])
+@pytest.mark.parametrize("resume", ["off", "auto"])
+def test_tables_without_a_configuration_are_not_written_over_either(command, resume, file):
+    path = getattr(RunDirectory(command().run_dir), file)
+    path.parent.mkdir(parents=True)
+    path.write_text("1\n")
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        plan(command(resume=resume))
+
+
+@pytest.mark.parametrize(("resume", "action"), [("on", "resume"), ("auto", "start over")])
+def test_a_run_that_ended_before_its_first_checkpoint_starts_over_if_it_may(command, resume, action):
+    begin(command())
+    assert plan(command(resume=resume))[0] == action
+
+
+@pytest.mark.parametrize("resume", ["on", "auto"])
+def test_a_run_goes_on_from_its_checkpoint(command, resume):
+    save(begin(command()))
+    assert plan(command(resume=resume)) == ("resume", command())
+
+
+@pytest.mark.parametrize("resume", ["on", "auto"])
+@pytest.mark.parametrize("budget", [160, 100])
+def test_there_is_nothing_to_do_for_a_finished_run(command, resume, budget):
+    directory = begin(command())
+    save(directory)
+    finish(directory, command())
+    assert plan(command(resume=resume, total_env_steps=budget), "total_env_steps")[0] == "nothing"
+
+
+@pytest.mark.parametrize("resume", ["on", "auto"])
+def test_a_finished_run_goes_on_with_a_larger_budget(command, resume):
+    directory = begin(command())
+    save(directory)
+    finish(directory, command())
+    asked = command(resume=resume, total_env_steps=161)
+    action, config = plan(asked, "total_env_steps")
+    assert (action, config.total_env_steps) == ("resume", 161)
+    assert plan(asked)[0] == "nothing"  # the command did not name it
+
+
+def test_a_command_changes_what_may_change_and_nothing_that_it_does_not_name(command):
+    save(begin(command()))
+    asked = command(resume="on", threads=2, checkpoint_every=7, planner={"horizon": 3}, seed=5)
+    _, config = plan(asked, "threads", "resume")
+    assert config == command(resume="on", threads=2)
+
+
+def test_a_command_may_repeat_a_setting_of_the_run_but_not_change_it(command):
+    save(begin(command()))
+    asked = command(resume="on", planner={"horizon": 3})
+    plan(asked, "planner.num_samples", "task")
+    with pytest.raises(ValueError) as caught:
+        plan(asked, "planner.horizon")
+    assert str(caught.value) == (
+        "planner.horizon=3 was asked for, but this run was started with planner.horizon=2; leave it out to go on, or "
+        "start a new run_dir."
+    )
+
+
+def test_a_changed_setting_is_checked_with_the_others(command):
+    with pytest.raises(ValueError, match="^total_env_steps must exceed the random phase"):
+        resumed_config(command(replay={"seed_decisions": 70}), command(total_env_steps=100), ["total_env_steps"])
+
+
+@pytest.mark.parametrize("text", ["planner: 3\n", "sede: 1\n", "- 1\n", "3\n", "a: [\n"])
+def test_a_configuration_of_something_else_is_refused_in_one_line(command, text):
+    directory = begin(command())
+    directory.config.write_text(text)
+    with pytest.raises(ValueError, match=r"config\.yaml is not a configuration") as caught:
+        plan(command(resume="auto"))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_directory_is_named_by_task_preset_and_seed(tmp_path, monkeypatch, tiny_config):
+    monkeypatch.chdir(tmp_path)
+    assert plan_launch(tiny_config(seed=3)).directory.path == Path("runs/cartpole-balance/cpu/seed3")
+    register_task(Task("some.module:make", "user", episode_length=40), lambda task, *, device: None, replace=True)
+    config = tiny_config(task="some.module:make")
+    assert plan_launch(config).directory.path == Path("runs/some.module.make/cpu/seed1")  # no colon in a file's name
+
+
+def test_the_home_directory_may_be_written_short(tmp_path, monkeypatch, tiny_config):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert plan_launch(tiny_config(run_dir="~/run")).directory.path == tmp_path / "run"
+
+
+@pytest.fixture
+def process() -> Iterator[None]:
+    """Restores what a launch sets for its process."""
+    threads, precision, state = torch.get_num_threads(), torch.get_float32_matmul_precision(), torch.get_rng_state()
+    yield
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(precision)
+    torch.set_rng_state(state)
+
+
+def is_free(directory: RunDirectory) -> bool:
+    """Whether another process could write there."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
+        child = os.fork()
+    if child == 0:
+        try:
+            other = RunDirectory(directory.path)
+            other.go_on()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    return os.waitpid(child, 0)[1] == 0
+
+
+needs_dm_control = pytest.mark.skipif(importlib.util.find_spec("dm_control") is None, reason="needs dm_control")
+
+
+@needs_dm_control
+def test_a_command_trains_to_its_summary_and_lets_others_in(command, process, read_table):
+    config = command(threads=1)
+    line = launch(config)
+    directory = RunDirectory(config.run_dir)
+    assert line.startswith("cartpole-balance: return ")
+    assert line.endswith(f"curve, tables and checkpoint are in {config.run_dir}")
+    assert directory.finished
+    assert read_run_config(directory) == config
+    assert [row["env_steps"] for row in read_table(directory.eval)] == [0, 100, 160]
+    assert is_free(directory)
+    assert launch(command(resume="auto")) == f"{config.run_dir} is finished; nothing to do"
+
+
+@needs_dm_control
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"planner": {"num_elites": 100}}, r"^planner\.num_elites must be at most num_samples=8, got 100\.$"),
+        ({"loss": {"rho": 0.0}}, r"^loss\.rho must be in"),
+        ({"optim": {"lr": 0.0}}, r"^optim\.lr must be positive"),
+        ({"reanalyze": {"num_slices": 0}}, r"^reanalyze\.num_slices must be at least 1"),
+        ({"device": "cuda"}, r"^device=cuda needs a CUDA device"),
+        ({"logger": "wandb"}, r"^logger=wandb needs wandb"),
+    ],
+    ids=lambda case: next(iter(case)) if isinstance(case, dict) else "",
+)
+def test_what_is_wrong_with_a_command_is_said_before_anything_is_written(
+    command, tmp_path, monkeypatch, process, changes, error
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "wandb" else find_spec(name))
+    with pytest.raises((ValueError, ImportError), match=error):
+        launch(command(**changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_dm_control
+def test_a_logger_that_does_not_start_leaves_the_directory_free(command, monkeypatch, process):
+    module = importlib.import_module("torchrl_etdmpc.training.launch")
+
+    def fail(*_: Any) -> None:
+        raise OSError("the logger's disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "make_logger", fail)
+        with pytest.raises(OSError, match="the logger's disk is full"):
+            launch(command())
+    assert not RunDirectory(command().run_dir).holds_a_run
+    assert plan(command())[0] == "begin"
+    directory = begin(command())
+    save(directory)
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "make_logger", fail)
+        with pytest.raises(OSError, match="the logger's disk is full"):
+            launch(command(resume="auto"))
+    assert plan(command(resume="auto"))[0] == "resume"  # a run that was there stays
+    assert is_free(directory)
+
+
+@needs_dm_control
+@pytest.mark.parametrize("error", [RuntimeError, RunInterrupted, KeyboardInterrupt])
+def test_others_are_kept_out_while_it_trains_and_let_in_however_it_ends(command, monkeypatch, process, error):
+    directory, free = RunDirectory(command().run_dir), []
+
+    def end(run: TrainingRun) -> None:
+        free.append(is_free(directory))
+        raise error("enough")
+
+    monkeypatch.setattr(TrainingRun, "run", end)
+    with pytest.raises(error, match="enough"):
+        launch(command())
+    assert free == [False]
+    assert is_free(directory)
+    assert plan(command(resume="auto"))[0] == "start over"
+
+
+@needs_dm_control
+def test_going_on_without_a_checkpoint_is_refused_and_changes_nothing(command, process):
+    directory = begin(command())
+    with pytest.raises(CheckpointError, match="^cannot resume: there is no checkpoint under"):
+        launch(command(resume="on"))
+    assert plan(command(resume="auto"))[0] == "start over"
+    assert is_free(directory)
+
+
+class Killed(BaseException):
+    pass
+
+
+def at_decision(monkeypatch: pytest.MonkeyPatch, number: int, act: Callable[[], None]) -> None:
+    """Calls ``act`` before the given decision of every collector."""
+    original = StepCollector.act
+
+    def watched(collector: StepCollector) -> Any:
+        if collector.frames == number - 1:
+            act()
+        return original(collector)
+
+    monkeypatch.setattr(StepCollector, "act", watched)
+
+
+def kill() -> None:
+    raise Killed
+
+
+@needs_dm_control
+def test_a_run_that_starts_over_forgets_its_rows(command, monkeypatch, process, read_table):
+    with monkeypatch.context() as patched:
+        at_decision(patched, 20, kill)
+        with pytest.raises(Killed):
+            launch(command())
+    directory = RunDirectory(command().run_dir)
+    assert [row["env_steps"] for row in read_table(directory.eval)] == [0]
+    launch(command(resume="auto"))
+    assert [row["env_steps"] for row in read_table(directory.eval)] == [0, 100, 160]
+
+
+@needs_dm_control
+def test_a_run_that_was_asked_to_stop_goes_on_to_the_same_end(command, tmp_path, monkeypatch, process):
+    straight = command(run_dir=str(tmp_path / "straight"))
+    launch(straight)
+    with monkeypatch.context() as patched:
+        at_decision(patched, 47, lambda: signal.raise_signal(signal.SIGTERM))
+        with pytest.raises(
+            RunInterrupted, match=r"^stopped at 94 env steps and saved in .*; go on with resume=true\.$"
+        ):
+            launch(command())
+    directory = RunDirectory(command().run_dir)
+    assert is_free(directory)
+    launch(command(resume="auto"))
+    tables = []
+    for path in (directory, RunDirectory(straight.run_dir)):
+        columns = [line.split(",") for file in (path.train, path.eval) for line in file.read_text().splitlines()]
+        tables.append([line[:3] + line[4:] for line in columns])  # without the wall time
+    assert tables[0] == tables[1]
+
+
+@needs_dm_control
+def test_a_finished_run_that_is_made_longer_is_not_finished_until_it_is(command, monkeypatch, process, read_table):
+    launch(command(total_env_steps=100))
+    asked = command(total_env_steps=140, resume="auto")
+    with monkeypatch.context() as patched:
+        at_decision(patched, 60, kill)
+        with pytest.raises(Killed):
+            launch(asked, ["total_env_steps"])
+    assert plan(asked, "total_env_steps")[0] == "resume"
+    launch(asked, ["total_env_steps"])
+    directory = RunDirectory(asked.run_dir)
+    assert directory.finished
+    assert [row["env_steps"] for row in read_table(directory.eval)] == [0, 100, 140]
