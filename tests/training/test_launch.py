@@ -133,6 +133,15 @@ def test_a_finished_run_goes_on_with_a_larger_budget(command, resume):
     assert plan(asked)[0] == "nothing"  # the command did not name it
 
 
+@pytest.mark.parametrize("resume", ["on", "auto"])
+def test_a_finished_run_without_checkpoints_keeps_its_results(command, resume):
+    directory = begin(command())
+    finish(directory, command())
+    with pytest.raises(FileNotFoundError, match=r"is finished and its checkpoints are gone, .* remove this one to tra"):
+        plan(command(resume=resume, total_env_steps=161), "total_env_steps")
+    assert directory.finished
+
+
 def test_a_command_changes_what_may_change_and_nothing_that_it_does_not_name(command):
     save(begin(command()))
     asked = command(resume="on", threads=2, checkpoint_every=7, planner={"horizon": 3}, seed=5)

@@ -56,7 +56,8 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
 
     Raises:
         FileExistsError: if the directory holds a run and ``resume`` is off.
-        FileNotFoundError: if there is no run to go on with and ``resume`` is on.
+        FileNotFoundError: if there is no run to go on with and ``resume`` is on, or a finished run without checkpoints
+            is to go on.
         ValueError: if the command names a setting with another value than the run's, and it may not change.
     """
     name = config.task.replace(":", ".")
@@ -69,6 +70,11 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
     merged = resumed_config(stored, config, explicit)
     if directory.finished and merged.total_env_steps <= stored.total_env_steps:
         return Launch(merged, directory, "nothing")
+    if directory.finished and not saved:  # starting over would remove the results of a whole run
+        raise FileNotFoundError(
+            f"run_dir={directory} is finished and its checkpoints are gone, so that it cannot go on; choose another "
+            "run_dir, or remove this one to train again."
+        )
     return Launch(merged, directory, "resume" if saved or config.resume == "on" else "start over")
 
 
