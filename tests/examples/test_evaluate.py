@@ -13,12 +13,12 @@ import torch
 pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
+from torchrl_etdmpc.collectors import evaluate  # noqa: E402
 from torchrl_etdmpc.envs import make_env  # noqa: E402
+from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
-    BarePolicy,
     TrainConfig,
     build_agent,
-    evaluate,
     load_agent,
     save_agent,
 )
@@ -198,7 +198,7 @@ def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, m
         raise AssertionError("the episodes had begun")
 
     monkeypatch.setattr("torchrl_etdmpc.envs.render_frame", render_frame)
-    monkeypatch.setattr("torchrl_etdmpc.training.evaluate", no_episodes)
+    monkeypatch.setattr("torchrl_etdmpc.collectors.evaluate", no_episodes)
     error, out, err = run_main(f"checkpoint={checkpoint}", "video=film.mp4", "device=cpu")
     assert error == "error: cannot render: there is no display; set MUJOCO_GL=egl before Python starts."
     assert (out, err) == ("", "")
