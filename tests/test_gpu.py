@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 import torch
 
+from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import (
     TrainConfig,
@@ -14,7 +15,6 @@ from torchrl_etdmpc.training import (
     build_collector,
     build_reanalyze,
     build_replay,
-    evaluate,
     preset,
 )
 

@@ -360,6 +360,8 @@ REFUSED_AT_ONCE = [
     ({"resume": "yes"}, "resume must be one of off, on, auto, got 'yes'."),
     ({"resume": 1}, "resume must be one of off, on, auto, got 1."),
     ({"checkpoint_minutes": 0.0}, "checkpoint_minutes must be positive or null, got 0.0."),
+    ({"seed": -1}, "seed must be in [0, 2**32 - 1], got -1."),
+    ({"seed": 2**32}, "seed must be in [0, 2**32 - 1], got 4294967296."),
     ({"device": "tpu"}, "device must be one of auto, cpu, cuda, cuda:N, got 'tpu'."),
     ({"compile": "most"}, "compile must be one of auto, off, default, max, got 'most'."),
     ({"logger": "mlflow"}, "logger must be one of none, tensorboard, wandb, got 'mlflow'."),

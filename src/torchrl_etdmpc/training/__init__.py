@@ -12,7 +12,7 @@ from torchrl_etdmpc.training.builders import (
 )
 from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, one_line_errors
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.evaluate import EvaluationResult, Evaluator
+from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
 from torchrl_etdmpc.training.launch import Launch, launch, plan_launch, read_run_config, resumed_config
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.presets import PRESETS, preset

@@ -193,6 +193,7 @@ class TrainConfig:
             self.checkpoint_minutes is None or self.checkpoint_minutes > 0,
             f"checkpoint_minutes must be positive or null, got {self.checkpoint_minutes}.",
         )
+        _require(0 <= self.seed < 2**32, f"seed must be in [0, 2**32 - 1], got {self.seed}.")
         counts = ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "checkpoint_keep", "log_every")
         least_one = {name: getattr(self, name) for name in (*counts, "max_faults", "max_skipped", "threads")}
         least_one |= {"optim.batch_size": self.optim.batch_size, "replay.capacity": self.replay.capacity}

@@ -18,7 +18,7 @@ from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
 from torchrl_etdmpc.training.agent_file import AgentFile
 from torchrl_etdmpc.training.config import TrainConfig
-from torchrl_etdmpc.training.evaluate import Evaluator
+from torchrl_etdmpc.training.evaluator import Evaluator
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.precompile import precompile
 from torchrl_etdmpc.training.run_state import Duty, RunState
@@ -55,7 +55,7 @@ class TrainingRun:
             eval_env,
             agent,
             episodes=config.eval_episodes,
-            seed=config.seed + 10_000,
+            seed=(config.seed + 10_000) % 2**32,  # other episodes than those of training
             with_policy=config.eval_policy,
         )
         self.store = CheckpointStore(log.directory.checkpoints, keep=config.checkpoint_keep)

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import math
-import random
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,8 +12,9 @@ from torchrl.envs import EnvBase, ExplorationType, SerialEnv, StepCounter
 from torchrl.envs.utils import exploration_type, set_exploration_type
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel
+from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.testing import LineWorld
-from torchrl_etdmpc.training import Agent, BarePolicy, EvaluationResult, Evaluator, build_agent, evaluate
 
 
 class CountingEnv(EnvBase):
@@ -185,83 +183,3 @@ def test_the_bare_policy_acts_with_the_mean_whatever_the_exploration():
         assert torch.equal(out["action"], mean)
         assert not out["action"].requires_grad
         assert set(out.keys()) == {"observation", "action"}
-
-
-@pytest.fixture
-def agent(tiny_config) -> Agent:
-    torch.manual_seed(0)
-    return build_agent(tiny_config(), 5, 1)
-
-
-def make_evaluator(agent: Agent, *, env_seed: int | None = None, **options) -> Evaluator:
-    """On episodes of 12 decisions; two of them side by side."""
-    pytest.importorskip("dm_control")
-    from torchrl_etdmpc.envs import make_env
-
-    env = make_env(
-        "cartpole-swingup",
-        seed=env_seed,
-        num_envs=2,
-        parallel=False,
-    ).append_transform(StepCounter(12))
-    return Evaluator(env, agent, **({"episodes": 3, "seed": 5} | options))
-
-
-def test_two_evaluations_of_the_same_weights_are_equal_to_the_last_bit(agent):
-    evaluator = make_evaluator(agent, env_seed=1)
-    first = evaluator()
-    torch.randn(7)
-    assert evaluator() == first
-    assert make_evaluator(agent, env_seed=2)() == first  # as in another process, whose environment is elsewhere
-    assert first.return_std > 0  # the episodes differ from each other
-    assert make_evaluator(agent, seed=6)() != first
-
-
-def test_other_weights_play_the_same_episodes(agent):
-    evaluator, starts = make_evaluator(agent), []
-    for _ in range(2):
-        seen: list[Tensor] = []
-        evaluator(on_step=lambda step, seen=seen: seen.append(step["observation"].clone()))
-        starts.append(torch.stack([seen[0], seen[12]]))
-        with torch.no_grad():
-            agent.world_model.policy.output.weight.add_(torch.randn_like(agent.world_model.policy.output.weight))
-    assert torch.equal(*starts)
-
-
-def test_an_evaluation_leaves_the_caller_s_random_numbers_as_they_are(agent):
-    evaluator = make_evaluator(agent, with_policy=True)
-    states = []
-    for act in (lambda: None, evaluator):
-        torch.manual_seed(3), np.random.seed(3), random.seed(3)
-        act()
-        states.append((torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()))
-    assert states[0] == states[1]
-
-
-def test_an_evaluation_that_is_left_leaves_the_random_numbers_too(agent):
-    def leave(step: TensorDictBase) -> None:
-        raise KeyboardInterrupt
-
-    state = torch.get_rng_state()
-    with pytest.raises(KeyboardInterrupt):
-        make_evaluator(agent)(on_step=leave)
-    assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_the_policy_without_the_planner_plays_the_same_episodes(agent):
-    with_policy, without = make_evaluator(agent, with_policy=True)(), make_evaluator(agent)()
-    assert with_policy[:3] == without[:3]
-    assert math.isnan(without.policy_return)
-    evaluator = make_evaluator(agent)
-    evaluator.env.set_seed(5)
-    expected = evaluate(evaluator.env, BarePolicy(agent.world_model), episodes=3).mean().item()
-    assert with_policy.policy_return == expected != with_policy.return_mean
-
-
-def test_the_result_is_that_of_the_planner(agent):
-    evaluator = make_evaluator(agent)
-    torch.manual_seed(5)
-    evaluator.env.set_seed(5)
-    returns = evaluate(evaluator.env, agent.eval_planner, episodes=3)
-    expected = EvaluationResult(returns.mean().item(), returns.std(correction=0).item(), 3)
-    assert evaluator()[:3] == expected[:3]
