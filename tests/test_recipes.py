@@ -84,7 +84,7 @@ def tiny_run(run_dir: Path, *, resume: bool = False, **changes: Any) -> Training
     log = RunLog(directory, total_env_steps=config.total_env_steps)
     env, eval_env = make_env(config.task_spec, seed=0), make_env(config.task_spec)
     run = TrainingRun(config, env=env, eval_env=eval_env, log=log)
-    (directory.go_on if resume else directory.begin)(config.to_dict())
+    directory.go_on() if resume else directory.begin(config.to_dict())
     return run
 
 

@@ -4,7 +4,8 @@ import io
 
 import pytest
 import torch
-from torchrl_etdmpc.training.interval_means import IntervalMeans
+
+from torchrl_etdmpc.runs import IntervalMeans
 
 
 def test_the_mean_is_over_the_values_of_the_interval():
