@@ -22,10 +22,11 @@ help:
 train: $(READY)
 	@$(VENV)/bin/python examples/train_dmc.py task=walker-stand preset=cpu seed=1 total_env_steps=25000 eval_every=5000 run_dir=$(RUN_DIR) $(ARGS)
 
+# In the order of their names: the files with few tests, which would otherwise come last, take longest.
 test: export MUJOCO_GL ?= disable
 test: export OMP_NUM_THREADS ?= 1
 test: $(READY)
-	@$(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile $(ARGS)
+	@$(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: export PYRIGHT_PYTHON_IGNORE_WARNINGS ?= 1# it would ask the network for newer versions of itself
 lint: $(READY)
