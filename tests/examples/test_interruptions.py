@@ -30,7 +30,8 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = (
     "preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=400 log_every=40 "
-    "eval_every=150 eval_episodes=1 checkpoint_every=30 model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 "
+    "task.episode_length=200 eval_every=150 eval_episodes=1 checkpoint_every=30 "
+    "model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 "
     "planner.horizon=2 planner.num_samples=8 planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 "
     "reanalyze.num_samples=6 reanalyze.num_elites=3 reanalyze.iterations=1 optim.batch_size=4 "
     "replay.seed_decisions=40 replay.pretrain_updates=4"
