@@ -31,11 +31,11 @@ class Benchmark:
     """A set of tasks that are compared at one budget.
 
     Args:
-        name: how commands know it.
-        title: how figures and tables call it.
-        tasks: in the order of the thesis' tables.
-        budget: env steps per run, at which final returns are read and up to which the AUC is taken.
-        action_repeat: env steps per decision step.
+        name (str): how commands know it.
+        title (str): how figures and tables call it.
+        tasks (tuple of str): in the order of the thesis' tables.
+        budget (int): env steps per run, at which final returns are read and up to which the AUC is taken.
+        action_repeat (int): env steps per decision step.
     """
 
     name: str
@@ -87,7 +87,7 @@ def benchmark_of(tasks: Iterable[str]) -> Benchmark:
     """The benchmark that holds all of the tasks.
 
     Args:
-        tasks: at least one name.
+        tasks (iterable of str): at least one name.
 
     Raises:
         ValueError: a task of no benchmark (the message holds the nearest names), or tasks of several.

@@ -28,17 +28,19 @@ class Comparison:
     """Everything that a report shows, as tables.
 
     Args:
-        benchmark: whose tasks and normaliser.
-        tasks: compared tasks, in the benchmark's order.
-        methods: in the order of tables and legends.
-        budget: env steps.
-        grid: env steps of the shared evaluation grid.
-        seed_curves: of the methods that are known per seed.
-        estimates: of all methods, one row per evaluation.
-        constants: by which tasks are normalised.
-        areas: ``method, task, auc, standard_error, seeds``, normalised, with the aggregate as the last task.
-        finals: ``method, task, mean, standard_error, seeds``, returns at the budget, the aggregate normalised.
-        notes: what a reader must know about the data.
+        benchmark (Benchmark): whose tasks and normaliser.
+        tasks (tuple of str): compared tasks, in the benchmark's order.
+        methods (tuple of str): in the order of tables and legends.
+        budget (int): env steps.
+        grid (ndarray): env steps of the shared evaluation grid.
+        seed_curves (DataFrame): of the methods that are known per seed.
+        estimates (DataFrame): of all methods, one row per evaluation.
+        constants (Series): by which tasks are normalised.
+        areas (DataFrame): ``method, task, auc, standard_error, seeds``, normalised, with the aggregate as the last
+            task.
+        finals (DataFrame): ``method, task, mean, standard_error, seeds``, returns at the budget, the aggregate
+            normalised.
+        notes (tuple of str): what a reader must know about the data.
     """
 
     benchmark: Benchmark

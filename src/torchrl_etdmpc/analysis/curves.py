@@ -33,7 +33,7 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     """The run directories in or below the paths: those that hold an ``eval.csv``.
 
     Args:
-        paths: run directories, or folders of run directories at any depth.
+        paths (iterable of str or Path): run directories, or folders of run directories at any depth.
 
     Returns:
         list of Path: sorted, each once.
@@ -59,8 +59,9 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
     that was resumed) the last counts.
 
     Args:
-        run_dir: holds ``eval.csv`` and one of ``config.yaml`` and ``summary.json``, which give task, preset and seed.
-        method: how figures and tables call the run. Default: its preset.
+        run_dir (str or Path): holds ``eval.csv`` and one of ``config.yaml`` and ``summary.json``, which give task,
+            preset and seed.
+        method (str, optional): how figures and tables call the run. Default: its preset.
 
     Returns:
         pandas.DataFrame: seed curve. Empty if the run has not evaluated yet.
@@ -150,7 +151,7 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
     env_steps, mean`` and, where known, ``standard_error`` and ``seeds`` (number of runs). Other columns are ignored.
 
     Args:
-        file: the CSV file. Steps are environment steps.
+        file (str or Path): the CSV file. Steps are environment steps.
 
     Returns:
         pandas.DataFrame: seed curves or estimates, whichever the file holds.
@@ -185,7 +186,7 @@ def join_curves(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """Joins seed curves, or estimates, of different files.
 
     Args:
-        tables: all of one kind, at least one.
+        tables (iterable of DataFrame): all of one kind, at least one.
 
     Raises:
         ValueError: if two of them hold the same curve: it would count twice.

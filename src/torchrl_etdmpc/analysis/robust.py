@@ -42,9 +42,9 @@ def interquartile_mean(scores: Mapping[str, Sequence[float]], *, resamples: int 
     """Mean of the middle half of all runs' scores, with a 95% percentile interval.
 
     Args:
-        scores: by task.
-        resamples: bootstrap resamples.
-        seed: of the bootstrap.
+        scores (dict): by task.
+        resamples (int): bootstrap resamples.
+        seed (int): of the bootstrap.
 
     Raises:
         ValueError: if there are no scores.
@@ -71,10 +71,10 @@ def probability_of_improvement(
     """Mean over tasks of P(a run scores more than a run of the baseline), ties counted half, with its 95% interval.
 
     Args:
-        scores: by task.
-        baseline: the same tasks.
-        resamples: bootstrap resamples.
-        seed: of the bootstrap.
+        scores (dict): by task.
+        baseline (dict): the same tasks.
+        resamples (int): bootstrap resamples.
+        seed (int): of the bootstrap.
 
     Raises:
         ValueError: if the tasks differ, or there are none.
