@@ -20,7 +20,7 @@ def make_my_env():
 _MORE = """
 import gymnasium
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
-from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
 from torchrl_etdmpc.envs import Task, register_task
 
 def scaled(*transforms, base=None, **options):
@@ -36,6 +36,7 @@ def repeats(): return scaled(frame_skip=4)
 def repeats_by_transform(): return scaled(FrameSkipTransform(4), StepCounter(10))
 def unscaled(): return GymEnv("Pendulum-v1")
 def number(): return 3
+def two(): return SerialEnv(2, limited)
 def broken(): return 1 / 0
 VALUE = 3
 
@@ -166,6 +167,7 @@ def test_a_task_of_a_file_keeps_its_numbers_and_maker(folder):
         ("my_file:other", r"task 'my_file:other': the module 'my_file' \(.*my_file\.py\) has no 'other'\."),
         ("more_tasks:VALUE", r"task 'more_tasks:VALUE' must be a function or a Task, got int\."),
         ("more_tasks:number", r"task 'more_tasks:number' must return a TorchRL environment, got int\."),
+        ("more_tasks:two", r"task 'more_tasks:two' must return one environment, got \[2\] of them; use num_envs=\."),
         ("more_tasks:OF_NOBODY", r"nothing makes the suite 'nobody' of task 'nobodys'; .*"),
     ],
 )

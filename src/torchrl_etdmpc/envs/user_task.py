@@ -130,6 +130,10 @@ def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
     env = function()
     if not isinstance(env, EnvBase):
         raise ValueError(f"task {path!r} must return a TorchRL environment, got {type(env).__name__}.")
+    if env.batch_size:
+        raise ValueError(
+            f"task {path!r} must return one environment, got {list(env.batch_size)} of them; use num_envs=."
+        )
     return env
 
 
