@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import runpy
 import subprocess
 import sys
@@ -34,10 +33,8 @@ def checkpoint(tmp_path_factory) -> Path:
     return save_agent(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 0})
 
 
-def test_the_files_run_in_a_process_that_has_pytorch_only(checkpoint, tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / "examples" / "export.py"), f"checkpoint={checkpoint}", "out=exported"]
-    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+def test_the_files_run_in_a_process_that_has_pytorch_only(checkpoint, tmp_path, run_script):
+    process = run_script("export.py", f"checkpoint={checkpoint}", "out=exported", cwd=tmp_path)
     assert (process.returncode, process.stderr) == (0, "")
     assert process.stdout == (
         "walker-walk: exported/policy.pt2 and exported/planner.pt2, observations [1, 24], actions [1, 6], "
@@ -85,10 +82,8 @@ def test_an_agent_of_a_gymnasium_task_is_exported(tmp_path, monkeypatch, capsys)
         )
 
 
-def test_a_missing_checkpoint_is_one_line(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
-    command = [sys.executable, str(ROOT / "examples" / "export.py"), "checkpoint=none.pt"]
-    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+def test_a_missing_checkpoint_is_one_line(tmp_path, run_script):
+    process = run_script("export.py", "checkpoint=none.pt", cwd=tmp_path)
     assert process.returncode == 1
     assert process.stderr == "error: none.pt is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt.\n"
     assert not (tmp_path / "exported").exists()

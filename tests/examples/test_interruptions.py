@@ -7,12 +7,13 @@ import csv
 import json
 import os
 import random
+import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,7 +28,6 @@ from torchrl_etdmpc.training import EXIT_CODE  # noqa: E402
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
-ROOT = Path(__file__).resolve().parents[2]
 COMMAND = (
     "preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=400 log_every=40 "
     "task.episode_length=200 eval_every=150 eval_episodes=1 checkpoint_every=30 "
@@ -38,28 +38,24 @@ COMMAND = (
 ).split()
 
 
-def start(cwd: Path, *arguments: str, task: str = "cartpole-balance") -> subprocess.Popen[str]:
-    script = ROOT / "examples" / ("train.py" if task.startswith("gym/") else "train_dmc.py")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
-    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [sys.executable, str(script), f"task={task}", *COMMAND, *arguments],
-        cwd=cwd,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+@pytest.fixture(scope="module")
+def train(start) -> Callable[..., Any]:
+    """Starts the run in a folder."""
+
+    def begin(cwd: Path, *arguments: str, task: str = "cartpole-balance") -> Any:
+        script = "train.py" if task.startswith("gym/") else "train_dmc.py"
+        return start(script, f"task={task}", *COMMAND, *arguments, cwd=cwd)
+
+    return begin
 
 
-def finish(process: subprocess.Popen[str], code: int = 0) -> str:
+def finish(process: Any, code: int = 0) -> str:
     out, err = process.communicate(timeout=300)
     assert process.returncode == code, err
     return out + err
 
 
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+def wait_for(condition: Callable[[], bool], process: Any) -> None:
     limit = time.monotonic() + 120
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -89,69 +85,77 @@ def results(run_dir: Path) -> dict[str, object]:
 
 
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory) -> dict[str, object]:
+def finished(tmp_path_factory, train) -> Path:
+    """The folder of a run without interruptions; tests that go on with it use a copy."""
     directory = tmp_path_factory.mktemp("straight")
-    finish(start(directory, "run_dir=run"))
-    return results(directory / "run")
+    finish(train(directory, "run_dir=run"))
+    return directory
 
 
-def kill_and_go_on(directory: Path, kills: int, seed: int, *arguments: str, **task: str) -> None:
+@pytest.fixture(scope="module")
+def straight(finished) -> dict[str, object]:
+    return results(finished / "run")
+
+
+def kill_and_go_on(
+    train: Callable[..., Any], directory: Path, kills: int, seed: int, *arguments: str, **task: str
+) -> None:
     """Kills the process at random moments, mostly between checkpoints and sometimes while one is written."""
     moments = random.Random(seed)
     run_dir = directory / "run"
     for _ in range(kills):
-        process = start(directory, "run_dir=run", "resume=auto", *arguments, **task)
+        process = train(directory, "run_dir=run", "resume=auto", *arguments, **task)
         before = checkpoints(run_dir)
         with contextlib.suppress(AssertionError):  # it may finish before it is killed
             wait_for(lambda known=before: checkpoints(run_dir) != known, process)
         time.sleep(moments.uniform(0, 0.3))
         process.kill()
         process.communicate()
-    finish(start(directory, "run_dir=run", "resume=auto", *arguments, **task))
+    finish(train(directory, "run_dir=run", "resume=auto", *arguments, **task))
 
 
-def test_a_run_that_is_killed_three_times_ends_as_if_it_had_not_been(tmp_path, straight):
-    kill_and_go_on(tmp_path, kills=3, seed=0)
+def test_a_run_that_is_killed_three_times_ends_as_if_it_had_not_been(tmp_path, train, straight):
+    kill_and_go_on(train, tmp_path, kills=3, seed=0)
     assert results(tmp_path / "run") == straight
 
 
-def test_a_run_on_a_task_that_terminates_is_exact_too(tmp_path):
+def test_a_run_on_a_task_that_terminates_is_exact_too(tmp_path, train):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
     (tmp_path / "straight").mkdir()
     (tmp_path / "killed").mkdir()
     task = "gym/InvertedPendulum-v5"
-    finish(start(tmp_path / "straight", "run_dir=run", task=task))
-    kill_and_go_on(tmp_path / "killed", 2, 0, task=task)
+    finish(train(tmp_path / "straight", "run_dir=run", task=task))
+    kill_and_go_on(train, tmp_path / "killed", 2, 0, task=task)
     straight = results(tmp_path / "straight" / "run")
     assert results(tmp_path / "killed" / "run") == straight
     assert sum(flag for (flag,) in straight["replay"]["('next', 'terminated')"]) > 10  # the head had something to learn
     assert any(name.startswith("termination_params.") for name in straight["weights"])
 
 
-def test_a_run_that_is_killed_before_its_first_checkpoint_starts_over(tmp_path, straight):
-    process = start(tmp_path, "run_dir=run", "resume=auto")
+def test_a_run_that_is_killed_before_its_first_checkpoint_starts_over(tmp_path, train, straight):
+    process = train(tmp_path, "run_dir=run", "resume=auto")
     wait_for((tmp_path / "run" / "eval.csv").exists, process)
     process.kill()
     process.communicate()
     assert checkpoints(tmp_path / "run") == []
-    finish(start(tmp_path, "run_dir=run", "resume=auto"))
+    finish(train(tmp_path, "run_dir=run", "resume=auto"))
     assert results(tmp_path / "run") == straight
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("compile=off",), ("compile=default",), ("num_envs=3",)], ids=" ".join)
-def test_a_run_that_is_killed_twenty_times_ends_as_if_it_had_not_been(tmp_path, arguments):
+def test_a_run_that_is_killed_twenty_times_ends_as_if_it_had_not_been(tmp_path, train, arguments):
     (tmp_path / "straight").mkdir()
     (tmp_path / "killed").mkdir()
-    finish(start(tmp_path / "straight", "run_dir=run", *arguments))
-    kill_and_go_on(tmp_path / "killed", 20, 1, *arguments)
+    finish(train(tmp_path / "straight", "run_dir=run", *arguments))
+    kill_and_go_on(train, tmp_path / "killed", 20, 1, *arguments)
     assert results(tmp_path / "killed" / "run") == results(tmp_path / "straight" / "run")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1], ids=lambda number: number.name)
-def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, straight, number):
-    process = start(tmp_path, "run_dir=run")
+def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, train, straight, number):
+    process = train(tmp_path, "run_dir=run")
     wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
     process.send_signal(number)
     tick = time.monotonic()
@@ -159,23 +163,23 @@ def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, straight,
     assert time.monotonic() - tick < 30
     assert "env steps and saved in run; go on with resume=true." in text
     assert "Traceback" not in text
-    finish(start(tmp_path, "run_dir=run", "resume=true"))
+    finish(train(tmp_path, "run_dir=run", "resume=true"))
     assert results(tmp_path / "run") == straight
 
 
-def test_a_signal_that_reaches_the_environments_too_is_left_to_the_run(tmp_path):
+def test_a_signal_that_reaches_the_environments_too_is_left_to_the_run(tmp_path, train):
     (tmp_path / "straight").mkdir()
-    finish(start(tmp_path / "straight", "run_dir=run", "num_envs=3"))
-    process = start(tmp_path, "run_dir=run", "num_envs=3")
+    finish(train(tmp_path / "straight", "run_dir=run", "num_envs=2"))
+    process = train(tmp_path, "run_dir=run", "num_envs=2")
     wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
     os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C does, and job schedulers
     assert "env steps and saved in run; go on with resume=true." in finish(process, EXIT_CODE)
-    finish(start(tmp_path, "run_dir=run", "resume=true"))
+    finish(train(tmp_path, "run_dir=run", "resume=true"))
     assert results(tmp_path / "run") == results(tmp_path / "straight" / "run")
 
 
-def test_a_second_signal_ends_the_process_at_once_and_the_last_checkpoint_stays(tmp_path, straight):
-    process = start(tmp_path, "run_dir=run")
+def test_a_second_signal_ends_the_process_at_once_and_the_last_checkpoint_stays(tmp_path, train, straight):
+    process = train(tmp_path, "run_dir=run")
     wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
     process.send_signal(signal.SIGSTOP)  # so that both arrive before the step is finished
     process.send_signal(signal.SIGTERM)
@@ -184,30 +188,27 @@ def test_a_second_signal_ends_the_process_at_once_and_the_last_checkpoint_stays(
     out, err = process.communicate(timeout=30)
     assert process.returncode in {128 + signal.SIGTERM, 128 + signal.SIGINT}, err
     assert "again: stopping at once; the last checkpoint stays." in err
-    finish(start(tmp_path, "run_dir=run", "resume=true"))
+    finish(train(tmp_path, "run_dir=run", "resume=true"))
     assert results(tmp_path / "run") == straight
 
 
-def test_a_second_run_in_the_same_directory_is_refused_while_the_first_one_goes_on(tmp_path, straight):
-    first = start(tmp_path, "run_dir=run")
+def test_a_second_run_in_the_same_directory_is_refused_while_the_first_one_goes_on(tmp_path, train, straight):
+    first = train(tmp_path, "run_dir=run")
     wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, first)
-    text = finish(start(tmp_path, "run_dir=run", "resume=true"), 1)
+    text = finish(train(tmp_path, "run_dir=run", "resume=true"), 1)
     assert "error: run_dir=run is in use by another process; wait for it or choose another run_dir." in text
     finish(first)
     assert results(tmp_path / "run") == straight
 
 
-def test_going_on_with_a_finished_run_does_nothing(tmp_path):
-    finish(start(tmp_path, "run_dir=run"))
+def test_going_on_with_a_finished_run_does_nothing(tmp_path, train, finished):
+    shutil.copytree(finished / "run", tmp_path / "run")
     before = results(tmp_path / "run")
-    assert "run is finished; nothing to do" in finish(start(tmp_path, "run_dir=run", "resume=auto"))
+    assert "run is finished; nothing to do" in finish(train(tmp_path, "run_dir=run", "resume=auto"))
     assert results(tmp_path / "run") == before
 
 
-def test_another_setting_than_the_run_s_is_refused(tmp_path):
-    process = start(tmp_path, "run_dir=run")
-    wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
-    process.terminate()
-    finish(process, EXIT_CODE)
-    text = finish(start(tmp_path, "run_dir=run", "resume=true", "optim.batch_size=8"), 1)
+def test_another_setting_than_the_run_s_is_refused(tmp_path, train, finished):
+    shutil.copytree(finished / "run", tmp_path / "run")
+    text = finish(train(tmp_path, "run_dir=run", "resume=true", "optim.batch_size=8"), 1)
     assert "error: optim.batch_size=8 was asked for, but this run was started with optim.batch_size=4;" in text

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
-import os
 import runpy
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -60,13 +58,6 @@ def fail():
 """
 
 
-def run_process(script: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
-    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / "examples" / script), *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600, check=False)
-
-
 def read_rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -111,9 +102,9 @@ def import_tasks() -> dict:
 TASKS = import_tasks()
 
 
-def test_a_gymnasium_task_trains_in_an_empty_directory_with_an_action_repeat(tmp_path):
+def test_a_gymnasium_task_trains_in_an_empty_directory_with_an_action_repeat(tmp_path, run_script):
     task = ("task=gym/Pendulum-v1", "task.action_repeat=2", "num_envs=2")
-    process = run_process("train.py", *task, *SMALL_RUN, cwd=tmp_path)
+    process = run_script("train.py", *task, *SMALL_RUN, cwd=tmp_path)
     assert process.returncode == 0, process.stderr
     assert "Warning" not in process.stderr
     run_dir = tmp_path / "runs" / "gym" / "Pendulum-v1" / "cpu" / "seed3"

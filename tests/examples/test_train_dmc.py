@@ -48,10 +48,10 @@ def file_hashes(directory: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+def finished(tmp_path_factory: pytest.TempPathFactory, run_script) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """A small run, started in an empty directory like a user would."""
     directory = tmp_path_factory.mktemp("empty")
-    return directory, run_process(str(SCRIPT), *SMALL_RUN, "run_dir=runs/first", cwd=directory)
+    return directory, run_script(SCRIPT, *SMALL_RUN, "run_dir=runs/first", cwd=directory)
 
 
 @pytest.fixture
@@ -138,10 +138,10 @@ def test_the_overrides_arrive_and_the_preset_gives_the_rest(finished):
     assert config.threads == base.threads
 
 
-def test_the_same_run_directory_is_refused_and_not_touched(finished):
+def test_the_same_run_directory_is_refused_and_not_touched(finished, run_script):
     directory, _ = finished
     before = file_hashes(directory)
-    again = run_process(str(SCRIPT), *SMALL_RUN, "run_dir=runs/first", cwd=directory)
+    again = run_script(SCRIPT, *SMALL_RUN, "run_dir=runs/first", cwd=directory)
     assert again.returncode == 1
     assert again.stdout == ""
     run_dir = Path("runs", "first")
