@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from itertools import count
@@ -289,14 +290,14 @@ def test_a_run_that_went_on_from_an_older_checkpoint_keeps_what_it_saves_then(tm
     assert {path.name for path in (tmp_path / "replay").iterdir()} == replay_files(tmp_path)
 
 
-@pytest.mark.parametrize("number", [1, 2, 4])
+@pytest.mark.parametrize("number", [1, 3, 5])
 def test_another_format_is_refused_in_one_line(store, number):
     save(store, 100, Work().do())
     file = store.folder / "resume" / f"{100:012d}" / "manifest.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"format": number}))
     with pytest.raises(CheckpointError) as caught:
         load(store.folder)
-    expected = f"cannot resume: {file.parent} has checkpoint format {number}; this version resumes from 3."
+    expected = f"cannot resume: {file.parent} has checkpoint format {number}; this version resumes from 4."
     assert str(caught.value) == expected
 
 
@@ -407,3 +408,91 @@ def test_looking_for_a_checkpoint_changes_nothing(store):
     assert CheckpointStore(store.folder).exists()
     assert tree(store.folder) == before
     assert load(store.folder)[0] == f"{100:012d}"  # it was moved aside for one that never came
+
+
+def test_weights_and_what_is_left_of_the_buffer_are_restored_on_request(store):
+    work = Work()
+    for step in range(1, 6):  # five rows each
+        save(store, step, work.do())
+    rows = json.loads((store.folder / "resume" / f"{5:012d}" / "manifest.json").read_text())["replay"]["rows"]
+    damage(store.folder / "replay" / rows[1]["file"], "a flipped bit")
+    with pytest.raises(CheckpointError, match="is not the file that was written"):
+        load(store.folder)
+    again = Work()
+    other = CheckpointStore(store.folder)
+    with pytest.warns(
+        UserWarning, match=r"/000000000005 with its weights and 15 of 25 rows of its buf.*; .*damaged\.$"
+    ):
+        other.salvage(again.parts, again.buffer)
+    assert (again.counter.number, again.layer.weight[0, 0].item()) == (5, 5)
+    wanted = work.buffer[10:25]
+    for key in ("x", ("plan", "loc"), ("plan", "scale"), ("plan", "value"), ("plan", "version")):
+        assert torch.equal(again.buffer[:][key], wanted[key])
+    expected = save(other, 6, again.do())  # and goes on from there
+    assert load(store.folder) == (f"{6:012d}", expected)
+    assert len(again.buffer) == 20
+
+
+def test_of_a_ring_that_has_wrapped_the_longest_stretch_is_left(store):
+    work = Work()
+    for step in range(1, 10):  # 45 rows into 30 places
+        save(store, step, work.do())
+    manifest = json.loads((store.folder / "resume" / f"{9:012d}" / "manifest.json").read_text())["replay"]
+    damage(
+        store.folder / "replay" / next(entry["file"] for entry in manifest["rows"] if entry["begin"] == 35),
+        "a flipped bit",
+    )
+    again = Work()
+    with pytest.warns(UserWarning, match="20 of 30 rows"):
+        CheckpointStore(store.folder).salvage(again.parts, again.buffer)
+    wanted = work.buffer.storage[:][torch.arange(15, 35) % 30]
+    assert torch.equal(again.buffer[:]["x"], wanted["x"])
+    assert torch.equal(again.buffer[:]["plan", "value"], wanted["plan", "value"])
+
+
+def test_rows_whose_targets_are_lost_are_left_out(store):
+    work = Work()
+    for step in range(1, 4):
+        save(store, step, work.do())
+    manifest = json.loads((store.folder / "resume" / f"{3:012d}" / "manifest.json").read_text())["replay"]
+    damage(
+        store.folder / "replay" / next(entry["file"] for entry in manifest["targets"] if entry["part"] == 0),
+        "a flipped bit",
+    )
+    again = Work()
+    with pytest.warns(UserWarning, match="5 of 15 rows"):
+        CheckpointStore(store.folder).salvage(again.parts, again.buffer)
+    assert torch.equal(again.buffer[:]["x"], work.buffer[10:15]["x"])
+
+
+def test_parts_that_are_damaged_everywhere_cannot_be_salvaged(store):
+    save(store, 1, Work().do())
+    damage(store.folder / "resume" / f"{1:012d}" / "layer.pt", "a flipped bit")
+    again = Work()
+    with pytest.raises(CheckpointError, match="^cannot resume: .*layer.pt is not the file that was written"):
+        CheckpointStore(store.folder).salvage(again.parts, again.buffer)
+    assert len(again.buffer) == 0
+
+
+def test_a_file_name_that_leads_outside_is_not_followed(store, tmp_path):
+    save(store, 1, Work().do())
+    file = store.folder / "resume" / f"{1:012d}" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    entry = manifest["replay"]["rows"][0]
+    victim = tmp_path / "victim.pt"
+    victim.write_bytes((store.folder / "replay" / entry["file"]).read_bytes())
+    entry["file"] = "../../victim.pt"
+    manifest.pop("sha256")
+    text = json.dumps(manifest, sort_keys=True)
+    file.write_text(json.dumps(manifest | {"sha256": hashlib.sha256(text.encode()).hexdigest()}))
+    with pytest.raises(CheckpointError, match=r"replay has no file '../../victim\.pt': that is not a name\.$"):
+        load(store.folder)
+    save(store, 2, Work().do())
+    assert victim.exists()
+
+
+def test_a_part_that_does_not_fit_is_named(store):
+    save(store, 1, Work().do())
+    other = Work()
+    with pytest.raises(CheckpointError, match=r"/000000000001/layer\.pt does not fit this run: Error\(s\) in loading"):
+        store.load({"layer": nn.Linear(3, 3)}, other.buffer)

@@ -113,7 +113,9 @@ def test_a_directory_that_holds_a_run_is_refused_and_not_touched(tmp_path, entry
     for refuse in (directory.require_new, lambda: directory.begin(CONFIG)):
         with pytest.raises(FileExistsError) as caught:
             refuse()
-        assert str(caught.value) == f"run_dir={tmp_path} already holds a run; choose another run_dir or remove it."
+        assert str(caught.value) == (
+            f"run_dir={tmp_path} already holds a run; go on with resume=auto, choose another run_dir or remove it."
+        )
     assert directory.holds_a_run
     assert snapshot(tmp_path) == before
 
@@ -200,12 +202,16 @@ def test_a_run_that_began_between_the_look_and_the_lock_is_not_overwritten(tmp_p
     directory, looked = RunDirectory(tmp_path / "run"), []
     require_new = RunDirectory.require_new
 
+    def finish_another() -> None:
+        other = RunDirectory(directory.path)
+        other.begin(CONFIG | {"seed": 2})
+        other.summary.write_text("{}")
+
     def slow(self: RunDirectory) -> None:
         require_new(self)
         if not looked:
             looked.append(True)
-            other = RunDirectory(self.path)
-            assert elsewhere(lambda: other.begin(CONFIG | {"seed": 2})) is None  # begins, and ends
+            assert elsewhere(finish_another) is None
 
     monkeypatch.setattr(RunDirectory, "require_new", slow)
     with pytest.raises(FileExistsError, match="already holds a run"):
@@ -266,10 +272,119 @@ def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch):
     assert directory.read_config() == CONFIG
 
 
-def test_an_abandoned_run_leaves_its_directory_free(begun):
+ROW = "env_steps,decision_steps,updates,wall_time_s,return_mean\n{},0,0,1.0,3.5\n"
+
+
+def leave_behind(directory: RunDirectory, **files: str) -> None:
+    """What a killed process leaves; the first words of a name are the folders."""
+    directory.path.mkdir(exist_ok=True)
+    directory.config.write_text(yaml.safe_dump(CONFIG))
+    for name, text in files.items():
+        file = directory.path.joinpath(*name.split("__")[:-1], name.split("__")[-1].replace("_", "."))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {},
+        {"eval_csv": ROW.format(0), "train_csv": ""},
+        {"checkpoints__resume__000000000000__manifest_json": "{}", "checkpoints__best_pt": "", "checkpoints__a_pt": ""},
+    ],
+    ids=["configuration", "first evaluation", "first checkpoint"],
+)
+def test_a_run_that_made_no_step_is_taken_over(tmp_path, files):
+    directory = RunDirectory(tmp_path / "run")
+    leave_behind(directory, notes_txt="mine", **files)
+    assert (directory.holds_a_run, directory.leftover) == (True, True)
+    directory.begin(CONFIG | {"seed": 2})
+    assert directory.read_config()["seed"] == 2
+    directory.close()
+    assert {path.name for path in directory.path.iterdir()} == {"config.yaml", "notes.txt"}
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"eval_csv": ROW.format(1000)},
+        {"train_csv": ROW.format(40)},
+        {"eval_csv": "my,own,table\n1,2,3\n"},
+        {"eval_csv": "env_steps\nmany\n"},
+        {"summary_json": "{}"},
+        {"checkpoints__resume__000000000050__manifest_json": "{}"},
+        {"config_yaml": "my: own"},
+        {"config_yaml": "- a list"},
+        {"config_yaml": "\x00"},
+    ],
+)
+def test_what_may_be_results_or_somebody_else_s_is_not_taken_over(tmp_path, files):
+    directory = RunDirectory(tmp_path / "run")
+    leave_behind(directory, **files)
+    before = snapshot(directory.path)
+    assert not directory.leftover
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        directory.begin(CONFIG)
+    assert snapshot(directory.path) == before
+
+
+def test_an_abandoned_run_leaves_nothing_behind(tmp_path):
+    directory = RunDirectory(tmp_path / "runs" / "walker")
+    directory.begin(CONFIG)
+    directory.eval.write_text(ROW.format(0))
+    (directory.checkpoints / "resume").mkdir(parents=True)
+    directory.abandon()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_abandoned_run_leaves_what_it_did_not_make(begun):
+    (begun.path / "notes.txt").write_text("mine")
     begun.abandon()
-    assert list(begun.path.iterdir()) == []
+    assert [path.name for path in begun.path.iterdir()] == ["notes.txt"]
     RunDirectory(begun.path).begin(CONFIG)
+
+
+OWN = ["config.yaml", "eval.csv", "train.csv", "curve.png", ".lock", "checkpoints", "checkpoints/replay", "tensorboard"]
+OWN += ["checkpoints/resume/000000000100/agent.pt", "checkpoints/last.pt", "wandb_id", "checkpoints/resume"]
+
+
+@pytest.mark.parametrize("kind", ["link", "link to nowhere", "pipe"])
+@pytest.mark.parametrize("name", OWN)
+def test_a_link_or_a_pipe_in_place_of_a_file_is_refused_and_nothing_elsewhere_changes(tmp_path, name, kind):
+    directory, victim, path = RunDirectory(tmp_path / "run"), tmp_path / "victim", tmp_path / "run" / name
+    directory.path.mkdir()
+    directory.config.write_text(yaml.safe_dump(CONFIG))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    victim.mkdir() if "." not in name[1:] else victim.write_text(yaml.safe_dump(CONFIG))
+    path.unlink(missing_ok=True)
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to(victim if kind == "link" else tmp_path / "nowhere")
+    before = snapshot(tmp_path)
+    for use in (directory.go_on, lambda: directory.begin(CONFIG)):
+        with pytest.raises((OSError, ValueError)) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+    assert snapshot(tmp_path) == before
+    assert os.path.lexists(path)
+    if name != "config.yaml":
+        with pytest.raises(OSError, match=f"^{path} is a link or a special file, through which a run would change so"):
+            directory.go_on()
+
+
+def test_the_directory_itself_may_be_a_link(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "disk")
+    RunDirectory(tmp_path / "run").begin(CONFIG)
+    assert (tmp_path / "disk" / "config.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["a: &a [x]\nb: [*a, *a]", "a: &a\n  b: *a", "x" * 2**21, "[" * 5000, "a: \x00", "a: [1"]
+)
+def test_a_hostile_configuration_is_refused_in_one_line_and_quickly(tmp_path, text):
+    directory = RunDirectory(tmp_path)
+    directory.config.write_text(text)
+    with pytest.raises(ValueError, match=rf"^{directory.config} is not a configuration: .{{5,200}}$"):
+        directory.read_config()
 
 
 def test_a_configuration_that_changed_is_stored_and_another_left_alone(begun):

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import pickle
+import zipfile
 from itertools import count
 from pathlib import Path
 
@@ -11,7 +12,16 @@ import pytest
 import torch
 
 from torchrl_etdmpc.runs import DamagedFileError
-from torchrl_etdmpc.runs.files import link, read_tensors, remove_partial_files, replacing, write_tensors, write_whole
+from torchrl_etdmpc.runs.files import (
+    link,
+    load_tensors,
+    read_tensors,
+    read_whole,
+    remove_partial_files,
+    replacing,
+    write_tensors,
+    write_whole,
+)
 
 OLD, NEW = b"old " * 1000, b"new " * 3000
 
@@ -24,7 +34,7 @@ def test_a_file_is_replaced_by_what_was_written(tmp_path):
     path = tmp_path / "notes.txt"
     for content in ("first", b"\x00second", "dritte Zeile \N{LATIN SMALL LETTER A WITH DIAERESIS}\n"):
         data = content.encode() if isinstance(content, str) else content
-        assert write_whole(path, content) == hashlib.sha256(data).hexdigest()
+        write_whole(path, content)
         assert path.read_bytes() == data
         assert names(tmp_path) == {"notes.txt"}
 
@@ -103,9 +113,9 @@ def test_partial_files_go_and_other_hidden_files_and_folders_stay(tmp_path):
 
 def test_tensors_come_back_and_the_checksum_is_the_file_s(tmp_path):
     content = {"x": torch.randn(3, 4), "n": 3, "list": [torch.arange(2), "text", None], "nested": {"y": 1.5}}
-    sha256 = write_tensors(tmp_path / "a.pt", content)
-    assert sha256 == hashlib.sha256((tmp_path / "a.pt").read_bytes()).hexdigest()
-    read = read_tensors(tmp_path / "a.pt", sha256)
+    stamp, data = write_tensors(tmp_path / "a.pt", content), (tmp_path / "a.pt").read_bytes()
+    assert stamp == {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    read = read_tensors(tmp_path / "a.pt", stamp)
     assert torch.equal(read.pop("x"), content.pop("x"))
     assert torch.equal(read["list"].pop(0), content["list"].pop(0))
     assert read == content
@@ -113,17 +123,17 @@ def test_tensors_come_back_and_the_checksum_is_the_file_s(tmp_path):
 
 def test_a_file_that_is_missing_or_not_what_was_written_is_named(tmp_path):
     path = tmp_path / "a.pt"
-    sha256 = write_tensors(path, {"x": torch.arange(100)})
+    stamp = write_tensors(path, {"x": torch.arange(100)})
     data = path.read_bytes()
     flipped = bytearray(data)
     flipped[len(data) // 2] ^= 1
     for damaged in (data[:-1], data[: len(data) // 2], b"", bytes(flipped), data + b"x"):
         path.write_bytes(damaged)
-        with pytest.raises(DamagedFileError, match=r"a\.pt is not the file that was written: it is cut off or damaged"):
-            read_tensors(path, sha256)
+        with pytest.raises(DamagedFileError, match=r"a\.pt (is not the file that was written|has 2,\d+ bytes)"):
+            read_tensors(path, stamp)
     path.unlink()
     with pytest.raises(DamagedFileError, match=r"a\.pt cannot be read \(No such file or directory\)\.$"):
-        read_tensors(path, sha256)
+        read_tensors(path, stamp)
 
 
 class Hostile:
@@ -136,12 +146,49 @@ def test_a_file_that_holds_anything_else_is_refused_even_if_its_checksum_is_righ
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "a.pt"
     if kind == "torch.save":
-        sha256 = write_tensors(path, {"rows": Hostile()})
+        stamp = write_tensors(path, {"rows": Hostile()})
     else:
-        sha256 = write_whole(path, pickle.dumps(Hostile()) if kind == "pickle" else b"noise")
-    with pytest.raises(DamagedFileError, match="holds more than tensors and plain containers; it was not loaded"):
-        read_tensors(path, sha256)
+        data = pickle.dumps(Hostile()) if kind == "pickle" else b"noise"
+        write_whole(path, data)
+        stamp = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    what = "holds more than tensors and plain containers; it was" if kind == "torch.save" else "is not a file of torch"
+    with pytest.raises(DamagedFileError, match=what):
+        read_tensors(path, stamp)
     assert names(tmp_path) == {"a.pt"}
+
+
+def test_a_file_that_unpacks_to_more_than_it_has_is_not_unpacked(tmp_path):
+    path = tmp_path / "a.pt"
+    torch.save({"x": torch.zeros(100_000)}, tmp_path / "plain.pt")
+    with zipfile.ZipFile(tmp_path / "plain.pt") as plain, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for entry in plain.infolist():
+            packed.writestr(entry.filename, plain.read(entry))
+    data = path.read_bytes()
+    assert len(data) < 10_000
+    with pytest.raises(
+        DamagedFileError, match=r"a\.pt is compressed, which no file of torch\.save is; it was not loaded"
+    ):
+        load_tensors(data, path)
+
+
+def test_what_is_not_a_file_or_too_large_is_refused_before_it_is_read(tmp_path):
+    pipe, large = tmp_path / "pipe", tmp_path / "large"
+    os.mkfifo(pipe)
+    with large.open("wb") as file:
+        file.truncate(2**43)  # takes no space
+    for path, what in (
+        (pipe, "is not a regular file"),
+        (Path("/dev/zero"), "is not a regular file"),
+        (tmp_path, "is not a regular file"),
+        (large, r"has 8,796,093,022,208 bytes; at most [\d,]+ are read"),
+        (tmp_path / "none", "cannot be read \\(No such file or directory\\)"),
+    ):
+        with pytest.raises(DamagedFileError, match=f"^{path} {what}\\.$"):
+            read_whole(path)
+    large.write_bytes(OLD)
+    assert read_whole(large, len(OLD)) == OLD
+    with pytest.raises(DamagedFileError, match="has 4,000 bytes; at most 3,999 are read"):
+        read_whole(large, len(OLD) - 1)
 
 
 def test_a_link_is_the_same_file_and_replaces_an_old_one(tmp_path):
@@ -174,13 +221,13 @@ def test_a_full_disk_leaves_the_old_file_whole_whatever_space_is_left(small_disk
     before = {"x": torch.arange(10)}
     for free in range(0, 200 * 1024, 4096):
         leave_free(small_disk, None)
-        sha256 = write_tensors(path, before)
+        stamp = write_tensors(path, before)
         leave_free(small_disk, free)
         try:
             new = write_tensors(path, content)
         except OSError as error:
             assert error.errno == errno.ENOSPC
-            torch.testing.assert_close(read_tensors(path, sha256), before)
+            torch.testing.assert_close(read_tensors(path, stamp), before)
         else:
             torch.testing.assert_close(read_tensors(path, new), content)
             taken.append(free)

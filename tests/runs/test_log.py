@@ -169,25 +169,30 @@ def test_a_table_that_was_not_there_yet_goes_and_may_begin_with_other_columns(tm
     assert read_csv(tmp_path / "train.csv")[0][4:] == ["b"]
 
 
-def test_a_run_that_starts_over_has_no_rows(tmp_path, log):
+@pytest.mark.parametrize("damage", ["rows removed", "a digit changed", "the file removed"])
+def test_what_happened_to_the_files_is_undone(tmp_path, log, damage):
     log.log_train({"a": 1.0}, **COUNTERS)
     log.log_eval(RESULTS, **COUNTERS)
-    log.start_over()
-    assert snapshot(tmp_path) == {}
-    assert log.directory.config.exists()
-    log.log_train({"b": 1.0}, **COUNTERS)
-
-
-def test_rows_that_were_removed_are_missed_and_nothing_else_is_cut(tmp_path, log):
-    log.log_train({"a": 1.0}, **COUNTERS)
     log.log_eval(RESULTS, **COUNTERS)
-    state = log.state_dict()
+    state, before, file = log.state_dict(), snapshot(tmp_path), log.directory.eval
+    text = file.read_text()
+    file.write_text(text[: len(text) // 2] if damage == "rows removed" else text.replace("31.0", "91.0"))
+    if damage == "the file removed":
+        file.unlink()
+    again = RunLog(log.directory, total_env_steps=2000)
+    again.load_state_dict(state)
+    again.log_eval(RESULTS, **COUNTERS)
+    after = snapshot(tmp_path)
+    assert after[str(log.directory.train)] == before[str(log.directory.train)]
+    assert after[str(file)] == before[str(file)] + text.splitlines(keepends=True)[-1].encode()
+
+
+def test_rows_that_somebody_else_wrote_do_not_stay(tmp_path, log):
+    log.log_train({"a": 1.0}, **COUNTERS)
+    with log.directory.train.open("a") as file:
+        file.write("mine\n")
     log.log_train({"a": 2.0}, **COUNTERS)
-    (tmp_path / "eval.csv").write_text("env_steps\n")
-    before = snapshot(tmp_path)
-    with pytest.raises(OSError, match=r"eval\.csv has 10 bytes but the checkpoint saw \d+: rows were removed from it"):
-        log.load_state_dict(state)
-    assert snapshot(tmp_path) == before
+    assert [row[4:] for row in read_csv(tmp_path / "train.csv")] == [["a"], ["1.0"], ["2.0"]]
 
 
 @pytest.fixture
@@ -230,3 +235,28 @@ def test_unwritten_rows_are_in_a_checkpoint(disk_log, small_disk, leave_free):
         again.log_train({"b": 2.0}, **COUNTERS)
     again.log_train({"a": 2.0}, **COUNTERS)
     assert [row[4:] for row in read_csv(log.directory.train)] == [["a"], ["1.0"], ["2.0"]]
+
+
+def test_a_run_whose_rows_cannot_be_written_is_not_finished(disk_log, small_disk, leave_free):
+    leave_free(small_disk, 0)
+    with pytest.warns(UserWarning, match="cannot be written"):
+        disk_log.log_train({"a": 1.0}, **COUNTERS)
+    with pytest.raises(OSError, match="No space left on device"):
+        disk_log.finish({"final_return": 1.0})
+    assert not disk_log.directory.finished
+    leave_free(small_disk, None)
+    disk_log.finish({"final_return": 1.0})
+    assert len(read_csv(disk_log.directory.train)) == 2
+
+
+def test_a_file_elsewhere_with_the_same_content_is_not_cut(tmp_path, log):
+    """A hard link looks like a file of the run."""
+    log.log_train({"a": 1.0}, **COUNTERS)
+    state = log.state_dict()
+    log.log_train({"a": 2.0}, **COUNTERS)
+    victim = tmp_path / "victim"
+    victim.hardlink_to(log.directory.train)
+    before = victim.read_bytes()
+    log.load_state_dict(state)
+    log.log_train({"a": 3.0}, **COUNTERS)
+    assert victim.read_bytes() == before

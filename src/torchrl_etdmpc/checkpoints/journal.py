@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_etdmpc.keys import TARGETS
-from torchrl_etdmpc.runs.files import read_tensors, remove_partial_files, write_tensors
+from torchrl_etdmpc.runs.files import DamagedFileError, read_tensors, remove_partial_files, write_tensors
 
 ROWS_PER_FILE = 16_384
 PARTS = 3
@@ -129,7 +129,7 @@ class ReplayJournal:
     def _write(self, name: str, content: TensorDictBase) -> dict[str, Any]:
         # A run that goes on from an older state must not meet the files of the future that it lost.
         file = f"{name}-{secrets.token_hex(4)}.pt"
-        return {"file": file, "sha256": write_tensors(self.folder / file, content.cpu().to_dict())}
+        return {"file": file, **write_tensors(self.folder / file, content.cpu().to_dict())}
 
     def load(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> None:
         """Fills an empty buffer, and goes on from there at the next :meth:`save`.
@@ -152,7 +152,7 @@ class ReplayJournal:
         if written:
             rows = self._read_rows(files)
             position = torch.arange(written - len(rows), written) % capacity
-            targets = self._read_targets(files, len(rows))
+            targets = self._read_targets(files["targets"], len(rows))
             if targets is not None:
                 rows.update(_rows(targets, position))
             rows.set("index", position)  # TensorDict buffers number their rows
@@ -165,16 +165,60 @@ class ReplayJournal:
             buffer.writer.load_state_dict(state)
         self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
 
+    def salvage(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> list[str]:
+        """Fills an empty buffer with the longest stretch of rows that can still be read, as if they were new.
+
+        The next :meth:`save` writes all of them again.
+
+        Args:
+            buffer (TensorDictReplayBuffer): of the capacity of the saved one.
+            files (mapping): what :meth:`save` returned.
+
+        Returns:
+            list of str: what is wrong with the files of the others.
+        """
+        capacity, written, faults = files["capacity"], files["written"], []
+        numbers = torch.arange(max(written - capacity, 0), written)  # the rows, in the order of their writing
+        first, position = written - len(numbers), numbers % capacity
+        readable = torch.zeros(len(numbers), dtype=torch.bool)
+        content: TensorDictBase | None = None
+        for entry in files["rows"]:
+            try:
+                rows = self._read(entry)
+            except DamagedFileError as error:
+                faults.append(str(error))
+                continue
+            content = cast(TensorDictBase, rows.new_zeros(torch.Size([len(numbers)]))) if content is None else content
+            begin, end = max(entry["begin"], first), entry["end"]
+            content[begin - first : end - first] = _rows(rows, slice(begin - entry["begin"], None))
+            readable[begin - first : end - first] = True
+        targets: TensorDictBase | None = None
+        for part in sorted({entry["part"] for entry in files["targets"]}):
+            entries = [entry for entry in files["targets"] if entry["part"] == part]
+            try:
+                targets = self._read_targets(entries, len(numbers), targets)
+            except DamagedFileError as error:  # which rows of this part it holds is not known
+                faults.append(str(error))
+                readable &= (position < entries[0]["begin"]) | (position >= entries[0]["begin"] + entries[0]["rows"])
+        begin, end = _longest(readable)
+        if content is not None and end > begin:
+            if targets is not None:
+                content.update(_rows(targets, position))
+            buffer.extend(_rows(content, slice(begin, end)))
+        self.state = {"written": 0, "version": 0, "rows": [], "targets": []}
+        return faults
+
     def _read_rows(self, files: Mapping[str, Any]) -> TensorDictBase:
         """The rows that are still in the buffer, in the order of their writing, without their targets."""
         rows = cast(TensorDictBase, torch.cat([self._read(entry) for entry in files["rows"]]))
         overwritten = max(files["written"] - files["capacity"], 0) - files["rows"][0]["begin"]  # of the oldest file
         return _rows(rows, slice(overwritten, None))
 
-    def _read_targets(self, files: Mapping[str, Any], count: int) -> TensorDictBase | None:
+    def _read_targets(
+        self, entries: Iterable[Mapping[str, Any]], count: int, content: TensorDictBase | None = None
+    ) -> TensorDictBase | None:
         """The targets of every row of the buffer, or ``None`` if it has none: each part's base, then its changes."""
-        content: TensorDictBase | None = None
-        for entry in files["targets"]:
+        for entry in entries:
             change = self._read(entry)
             begin = entry.get("begin")  # a base is a range of rows, a change lists them
             index = change.pop("index").long() if begin is None else slice(begin, begin + entry["rows"])
@@ -184,7 +228,9 @@ class ReplayJournal:
         return content
 
     def _read(self, entry: Mapping[str, Any]) -> TensorDict:
-        content = read_tensors(self.folder / entry["file"], entry["sha256"])
+        if Path(entry["file"]).name != entry["file"]:
+            raise DamagedFileError(f"{self.folder} has no file {entry['file']!r}: that is not a name.")
+        content = read_tensors(self.folder / entry["file"], entry)
         return TensorDict(content, [len(next(iter(_leaves(content))))])
 
     def prune(self, kept: Iterable[Mapping[str, Any]]) -> None:
@@ -198,6 +244,16 @@ class ReplayJournal:
         for file in self.folder.glob("*.pt"):
             if file.name not in named:
                 file.unlink(missing_ok=True)
+
+
+def _longest(flags: Tensor) -> tuple[int, int]:
+    """Begin and end of the longest stretch of true flags."""
+    edges = torch.cat([flags.new_zeros(1), flags, flags.new_zeros(1)]).long().diff()
+    begins, ends = (edges == 1).nonzero().flatten(), (edges == -1).nonzero().flatten()
+    if not len(begins):
+        return 0, 0
+    best = (ends - begins).argmax()
+    return int(begins[best]), int(ends[best])
 
 
 def _leaves(content: Mapping[str, Any]) -> Iterable[Tensor]:

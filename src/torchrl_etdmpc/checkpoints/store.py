@@ -14,24 +14,27 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_etdmpc.checkpoints.journal import ReplayJournal
+from torchrl_etdmpc.runs.errors import first_line
 from torchrl_etdmpc.runs.files import (
     DamagedFileError,
     link,
     read_tensors,
+    read_whole,
     remove_partial_files,
     sync,
     write_tensors,
     write_whole,
 )
 
-FORMAT = 3
+FORMAT = 4
+_MANIFEST_BYTES = 2**26
 
 
 class CheckpointError(RuntimeError):
@@ -143,22 +146,56 @@ class CheckpointStore:
         faults = []
         for folder in reversed(self._folders()):
             try:
-                manifest = _read_manifest(folder)
-                missing = sorted(parts.keys() - manifest["files"].keys())
-                if missing:
-                    raise CheckpointError(f"{folder} lacks {', '.join(missing)}")
-                states = {name: read_tensors(folder / f"{name}.pt", manifest["files"][name]) for name in parts}
+                states, manifest = self._read(folder, parts)
                 self.journal.load(buffer, manifest["replay"])
-            except (DamagedFileError, CheckpointError, KeyError, OSError) as error:
-                faults.append(str(error) if str(error) else type(error).__name__)
+            except (DamagedFileError, CheckpointError) as error:
+                faults.append(str(error).rstrip("."))
                 continue
-            for name, part in parts.items():
-                part.load_state_dict(states[name])
+            _restore(folder, parts, states)
             for fault in faults:
-                warnings.warn(f"going on from {folder}, because {fault}", stacklevel=2)
+                warnings.warn(f"going on from {folder}, because {fault}.", stacklevel=2)
             return folder
-        reason = "; ".join(faults) or f"there is no checkpoint under {self.folder}"
-        raise CheckpointError(f"cannot resume: {reason.rstrip('.')}.")
+        raise CheckpointError(f"cannot resume: {self._reason(faults)}.")
+
+    def salvage(self, parts: Mapping[str, Part], buffer: TensorDictReplayBuffer) -> Path:
+        """Restores parts from the newest checkpoint whose parts are whole, and what is left of its buffer.
+
+        The buffer gets the longest stretch of rows that can be read, as if they were new. What is lost is a warning.
+
+        Returns:
+            Path: the checkpoint's folder.
+
+        Raises:
+            CheckpointError: if there is none.
+        """
+        faults = []
+        for folder in reversed(self._folders()):
+            try:
+                states, manifest = self._read(folder, parts)
+            except (DamagedFileError, CheckpointError) as error:
+                faults.append(str(error).rstrip("."))
+                continue
+            damage = self.journal.salvage(buffer, manifest["replay"])
+            saved = min(manifest["replay"]["written"], manifest["replay"]["capacity"])
+            _restore(folder, parts, states)
+            why = "".join(f"; {fault.rstrip('.')}" for fault in (*faults, *damage))
+            warnings.warn(
+                f"going on from {folder} with its weights and {len(buffer):,} of {saved:,} rows of its buffer{why}.",
+                stacklevel=2,
+            )
+            return folder
+        raise CheckpointError(f"cannot resume: {self._reason(faults)}.")
+
+    def _read(self, folder: Path, parts: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The states of a checkpoint's parts, and its manifest."""
+        manifest = _read_manifest(folder)
+        missing = sorted(set(parts) - manifest["files"].keys())
+        if missing:
+            raise CheckpointError(f"{folder} lacks {', '.join(missing)}")
+        return {name: read_tensors(folder / f"{name}.pt", manifest["files"][name]) for name in parts}, manifest
+
+    def _reason(self, faults: list[str]) -> str:
+        return "; ".join(faults) or f"there is no checkpoint under {self.folder}"
 
     def exists(self) -> bool:
         """Whether there is something to go on from. Changes nothing: another process may be training here."""
@@ -188,11 +225,19 @@ class CheckpointStore:
         self.journal.prune(kept)
 
 
+def _restore(folder: Path, parts: Mapping[str, Part], states: Mapping[str, Any]) -> None:
+    for name, part in parts.items():
+        try:
+            part.load_state_dict(states[name])
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise CheckpointError(f"{folder}/{name}.pt does not fit this run: {first_line(error)}") from error
+
+
 def _read_manifest(folder: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        manifest = json.loads(read_whole(folder / "manifest.json", _MANIFEST_BYTES))
         number = manifest["format"]
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, DamagedFileError) as error:
         raise CheckpointError(f"{folder}/manifest.json is missing or damaged") from error
     if number != FORMAT:
         raise CheckpointError(f"{folder} has checkpoint format {number}; this version resumes from {FORMAT}")

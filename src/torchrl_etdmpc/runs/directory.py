@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import os
+import shutil
+import stat
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_etdmpc.runs.files import write_whole
+from torchrl_etdmpc.runs.files import DamagedFileError, read_whole, write_whole
 
 _LOCK = ".lock"
+_CONFIG_BYTES = 2**20
 
 
 class RunDirectory:
@@ -30,7 +35,7 @@ class RunDirectory:
         summary (Path): ``summary.json``, written last: a directory that holds it is a finished run.
         checkpoints (Path): what the run goes on from.
         last_agent (Path): ``checkpoints/last.pt``, the weights of the newest checkpoint.
-        best_agent (Path): ``checkpoints/best.pt``, those of the checkpoint with the best evaluation before it.
+        best_agent (Path): ``checkpoints/best.pt``, those with the best evaluation.
         tensorboard (Path): that logger's files.
         wandb_id (Path): by which the run is known there.
 
@@ -51,6 +56,7 @@ class RunDirectory:
         self.tensorboard = self.path / "tensorboard"
         self.wandb_id = self.path / "wandb_id"
         self._unlock: weakref.finalize | None = None
+        self._made: list[Path] = []  # folders, the outermost first
 
     def __str__(self) -> str:
         return str(self.path)
@@ -59,6 +65,16 @@ class RunDirectory:
     def holds_a_run(self) -> bool:
         """Whether any file of a run is there."""
         return any(map(os.path.lexists, (self.config, self.eval, self.train, self.summary, self.checkpoints)))
+
+    @property
+    def leftover(self) -> bool:
+        """Whether a run began here and ended before its first step, so that nothing is lost if another one begins."""
+        try:
+            ours = {"task", "preset", "seed"} <= set(self.read_config())
+        except (OSError, ValueError, TypeError):
+            return False
+        later = any(folder.name.strip("0") for folder in self.checkpoints.glob("resume/[0-9]*"))
+        return ours and not (os.path.lexists(self.summary) or later or any(map(_has_steps, (self.train, self.eval))))
 
     @property
     def finished(self) -> bool:
@@ -74,20 +90,27 @@ class RunDirectory:
         """
         import yaml
 
-        if not self.config.is_file():
+        if not os.path.lexists(self.config):
             raise FileNotFoundError(f"run_dir={self} holds no run to go on with; start it with resume=off.")
         try:
-            return yaml.safe_load(self.config.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            text = read_whole(self.config, _CONFIG_BYTES).decode()
+            if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):  # few bytes can mean gigabytes
+                raise ValueError("it refers to itself")
+            return yaml.safe_load(text)
+        except (yaml.YAMLError, UnicodeDecodeError, DamagedFileError, ValueError, RecursionError) as error:
             raise ValueError(f"{self.config} is not a configuration: {' '.join(str(error).split())}") from error
 
     def require_new(self) -> None:
-        """Raises FileExistsError if the directory already holds a run."""
-        if self.holds_a_run:
-            raise FileExistsError(f"run_dir={self} already holds a run; choose another run_dir or remove it.")
+        """Raises FileExistsError if the directory already holds a run that made a step."""
+        if self.holds_a_run and not self.leftover:
+            raise FileExistsError(
+                f"run_dir={self} already holds a run; go on with resume=auto, choose another run_dir or remove it."
+            )
 
     def begin(self, config: Mapping[str, Any]) -> None:
         """Makes the directory of a new run, locks it and writes the configuration; checks come before any change.
+
+        What is left of a run that ended before its first step is removed.
 
         Args:
             config (mapping): nested dicts of numbers, strings, booleans, None and lists; ``task``, ``preset`` and
@@ -101,17 +124,21 @@ class RunDirectory:
         """
         text = _to_yaml(config)
         self.require_new()
+        missing = [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise self._not_writable(error) from error
+        self._made = missing[::-1]
         self._lock()
         try:
             self.require_new()  # two processes may have come this far; only one has the lock
-        except FileExistsError:
+            self._remove_files()
+            self._write_config(text)
+        except BaseException:
             self.close()
+            self._remove_folders()
             raise
-        self._write_config(text)
 
     def go_on(self) -> None:
         """Locks the directory of a run that goes on.
@@ -135,15 +162,29 @@ class RunDirectory:
             self._write_config(text)
 
     def abandon(self) -> None:
-        """Forgets a run that never began, so that its directory is free again."""
-        self.config.unlink(missing_ok=True)
+        """Forgets a run that made no step: its files go, and the folders that were made for it."""
+        self._remove_files()
         self.close()
+        self._remove_folders()
 
     def close(self) -> None:
         """Lets other processes in, and leaves no lock behind."""
         if self._unlock is not None:
             self._unlock()
             self._unlock = None
+
+    def _remove_files(self) -> None:
+        for file in (self.train, self.eval, self.curve, self.wandb_id):
+            file.unlink(missing_ok=True)
+        for folder in (self.checkpoints, self.tensorboard):
+            shutil.rmtree(folder, ignore_errors=True)
+        self.config.unlink(missing_ok=True)  # last: without it the rest is not a leftover
+
+    def _remove_folders(self) -> None:
+        for folder in reversed(self._made):
+            with contextlib.suppress(OSError):  # something else is in it now
+                folder.rmdir()
+        self._made = []
 
     def _write_config(self, text: str) -> None:
         try:
@@ -157,8 +198,25 @@ class RunDirectory:
             f"run_dir={self} cannot be written ({error.strerror}); choose a directory that you can write to."
         )
 
+    def _require_own_files(self) -> None:
+        """Raises OSError if a file of the run is a link or a device: writing it would change something elsewhere."""
+        own = [path for path in vars(self).values() if isinstance(path, Path) and path != self.path]
+        inside = [
+            Path(folder, name)
+            for top in (self.checkpoints, self.tensorboard)
+            for folder, folders, files in os.walk(top)  # which does not follow links
+            for name in (*folders, *files)
+        ]
+        for path in (*own, self.path / _LOCK, *inside):
+            if os.path.lexists(path) and stat.S_IFMT(path.lstat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+                raise OSError(
+                    f"{path} is a link or a special file, through which a run would change something elsewhere; "
+                    "put the file itself there, or choose another run_dir."
+                )
+
     def _lock(self) -> None:
         """Keeps other processes out until :meth:`close`, or until this process ends; nothing without system locks."""
+        self._require_own_files()
         try:
             import fcntl
         except ImportError:  # Windows
@@ -187,6 +245,17 @@ class RunDirectory:
 def _unlock(lock: Path, descriptor: int) -> None:
     lock.unlink(missing_ok=True)
     os.close(descriptor)
+
+
+def _has_steps(table: Path) -> bool:
+    """Whether a table holds a row of a later moment than the start, or something else than rows."""
+    if not os.path.lexists(table):
+        return False
+    try:
+        rows = list(csv.DictReader(read_whole(table).decode().splitlines()))
+        return any(int(row["env_steps"]) > 0 for row in rows)
+    except (DamagedFileError, ValueError, KeyError, TypeError, csv.Error):
+        return True
 
 
 def _to_yaml(config: Mapping[str, Any]) -> str:

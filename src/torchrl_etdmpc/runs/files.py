@@ -6,7 +6,9 @@ import hashlib
 import io
 import os
 import shutil
-from collections.abc import Iterator
+import stat
+import zipfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -40,33 +42,90 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_whole(path: Path, content: bytes | memoryview | str) -> str:
-    """Writes a file that survives a power cut or is not there; returns its SHA-256."""
-    data = content.encode() if isinstance(content, str) else content
+def write_whole(path: Path, content: bytes | bytearray | memoryview | str) -> None:
+    """Writes a file that survives a power cut or is not there."""
     with replacing(path) as partial:
-        partial.write_bytes(data)
-    return hashlib.sha256(data).hexdigest()
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def write_tensors(path: Path, content: Any) -> str:
-    """Writes tensors and plain containers with :func:`write_whole`; returns the file's SHA-256."""
+def read_whole(path: Path, limit: int | None = None) -> bytes:
+    """Reads a regular file.
+
+    Args:
+        path (Path): a link is followed; a pipe or a device, which might never end, is refused.
+        limit (int, optional): bytes that it may have, at most a quarter of this machine's memory. Default: that.
+
+    Raises:
+        DamagedFileError: if it is missing, is something else than a file or is larger.
+    """
+    most = _memory() // 4
+    limit = most if limit is None else min(limit, most)
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe without a writer would wait
+        with open(descriptor, "rb") as file:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise DamagedFileError(f"{path} is not a regular file.")
+            if status.st_size > limit:
+                raise DamagedFileError(f"{path} has {status.st_size:,} bytes; at most {limit:,} are read.")
+            return file.read()
+    except OSError as error:
+        raise DamagedFileError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+def _memory() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # Windows
+        return 2**34
+
+
+def write_tensors(path: Path, content: Any) -> dict[str, Any]:
+    """Writes tensors and plain containers with :func:`write_whole`.
+
+    Returns:
+        dict: its ``size`` in bytes and its ``sha256``, without which :func:`read_tensors` reads nothing.
+    """
     memory = io.BytesIO()  # torch.save itself answers a full disk with an error that does not say so
     torch.save(content, memory)
-    return write_whole(path, memory.getbuffer())
+    data = memory.getbuffer()
+    write_whole(path, data)
+    return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
-def read_tensors(path: Path, sha256: str) -> Any:
+def read_tensors(path: Path, stamp: Mapping[str, Any]) -> Any:
     """Reads a file of :func:`write_tensors` without running any code in it.
+
+    Args:
+        path (Path): the file.
+        stamp (mapping): what :func:`write_tensors` returned.
 
     Raises:
         DamagedFileError: if it is missing, has changed or holds something else.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DamagedFileError(f"{path} cannot be read ({error.strerror}).") from error
-    if hashlib.sha256(data).hexdigest() != sha256:
+    data = read_whole(path, stamp["size"])
+    if hashlib.sha256(data).hexdigest() != stamp["sha256"]:
         raise DamagedFileError(f"{path} is not the file that was written: it is cut off or damaged.")
+    return load_tensors(data, path)
+
+
+def load_tensors(data: bytes, path: Path) -> Any:
+    """The tensors and plain containers in the content of a file of ``torch.save``; no code in it is run.
+
+    Raises:
+        DamagedFileError: if it is not such a file, is damaged or holds something else.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > len(data):  # torch.save compresses nothing
+                raise DamagedFileError(f"{path} is compressed, which no file of torch.save is; it was not loaded.")
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, EOFError) as error:
+        if isinstance(error, DamagedFileError):
+            raise
+        raise DamagedFileError(f"{path} is not a file of torch.save: cut off, damaged or another kind.") from error
+    if damaged is not None:
+        raise DamagedFileError(f"{path} is damaged: the checksum of {damaged} in it is wrong.")
     try:
         return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # the errors of hostile files advise to run their code

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import json
 import math
 import os
@@ -59,8 +60,9 @@ class RunLog:
         self.total_env_steps = total_env_steps
         self.logger: Logger | None = None
         self._files: dict[Table, Path] = {"train": directory.train, "eval": directory.eval}
-        self._columns: dict[Table, tuple[str, ...]] = {}
-        self._unwritten: dict[Table, list[dict[str, float]]] = {"train": [], "eval": []}
+        self._columns: dict[Table, list[str]] = {}
+        self._content: dict[Table, bytearray] = {"train": bytearray(), "eval": bytearray()}  # of the whole files
+        self._written: dict[Table, int] = {"train": 0, "eval": 0}  # bytes of it that are on disk
 
     def log_train(
         self, metrics: Mapping[str, Any], *, env_steps: int, decision_steps: int, updates: int, wall_time_s: float
@@ -106,14 +108,19 @@ class RunLog:
         )
 
     def finish(self, summary: Mapping[str, Any]) -> Path:
-        """Writes ``summary.json`` and closes the logger. Numbers that JSON cannot hold (nan, inf) become null.
+        """Writes rows that are still kept, then ``summary.json``. Numbers that JSON cannot hold (nan, inf) become null.
 
         Args:
             summary (mapping): what the run came to; ``versions`` is added from :func:`library_versions` unless given.
 
         Returns:
             Path: ``summary.json``.
+
+        Raises:
+            OSError: if something cannot be written; without ``summary.json`` the run is not finished.
         """
+        for table in self._files:
+            self._write(table)
         content = _to_json({**summary, "versions": summary.get("versions", library_versions())})
         write_whole(self.directory.summary, json.dumps(content, indent=2, allow_nan=False) + "\n")
         self.close()
@@ -125,37 +132,27 @@ class RunLog:
             self.logger.shutdown()
             self.logger = None
 
-    def start_over(self) -> None:
-        """Removes the rows of a run that ended before its first checkpoint."""
-        self.load_state_dict({"sizes": {"train": 0, "eval": 0}, "unwritten": {"train": [], "eval": []}})
-
     def state_dict(self) -> dict[str, Any]:
-        """How long the files are: a run that goes on from here forgets what was written later."""
-        sizes = {table: file.stat().st_size if file.exists() else 0 for table, file in self._files.items()}
-        return {"sizes": sizes, "unwritten": {table: list(rows) for table, rows in self._unwritten.items()}}
+        """What the files hold: a run that goes on from here forgets what was written later, and what was damaged."""
+        return {table: content.decode() for table, content in self._content.items()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Cuts the files off where they ended when :meth:`state_dict` was called.
+        """Gives the files the content that they had when :meth:`state_dict` was called.
 
         Raises:
-            OSError: a file is shorter than it was.
+            OSError: if a file cannot be written.
         """
         for table, file in self._files.items():
-            size, present = state_dict["sizes"][table], file.stat().st_size if file.exists() else 0
-            if present < size:
-                raise OSError(f"{file} has {present} bytes but the checkpoint saw {size}: rows were removed from it.")
-        for table, file in self._files.items():
-            size, unwritten = state_dict["sizes"][table], list(state_dict["unwritten"][table])
-            self._unwritten[table] = unwritten
-            self._columns.pop(table, None)
-            if size:
-                os.truncate(file, size)
-                with file.open(newline="", encoding="utf-8") as opened:
-                    self._columns[table] = tuple(next(csv.reader(opened)))
-            else:
+            content = state_dict[table].encode()
+            present = file.read_bytes() if file.exists() else b""
+            if not content:
                 file.unlink(missing_ok=True)
-                if unwritten:
-                    self._columns[table] = tuple(unwritten[0])
+            elif not content.startswith(present):  # otherwise the next row brings what is missing
+                write_whole(file, content)
+            self._content[table], self._written[table] = bytearray(content), min(len(present), len(content))
+            self._columns.pop(table, None)
+            if content:
+                self._columns[table] = next(csv.reader([state_dict[table].splitlines()[0]]))
 
     def _append(self, table: Table, values: Mapping[str, Any], counters: dict[str, float]) -> None:
         file, columns = self._files[table], self._columns.get(table)
@@ -168,19 +165,15 @@ class RunLog:
                     "log it from the first row on, as nan until it is known."
                 )
         row = counters | {name: _to_number(name, value) for name, value in values.items()}
-        columns = self._columns.setdefault(table, tuple(row))
-        self._unwritten[table].append(row)
-        size = file.stat().st_size if file.exists() else 0
+        text = io.StringIO()
+        writer = csv.DictWriter(text, self._columns.setdefault(table, list(row)), lineterminator="\n")
+        if not self._content[table]:
+            writer.writeheader()
+        writer.writerow(row)
+        self._content[table] += text.getvalue().encode()
         try:
-            with file.open("a", newline="", encoding="utf-8") as opened:
-                writer = csv.DictWriter(opened, columns, lineterminator="\n")
-                if not size:
-                    writer.writeheader()
-                writer.writerows(self._unwritten[table])
-            self._unwritten[table] = []
+            self._write(table)
         except OSError as error:  # a full disk should not end the run
-            with contextlib.suppress(OSError):
-                os.truncate(file, size)  # no half row
             warnings.warn(
                 f"{file} cannot be written ({error.strerror}); its rows are kept and written with the next one.",
                 stacklevel=4,
@@ -188,6 +181,21 @@ class RunLog:
         if self.logger is not None:
             shown = {f"{table}/{name}": value for name, value in row.items() if name != "env_steps"}
             self.logger.log_metrics(shown, step=int(row["env_steps"]))
+
+    def _write(self, table: Table) -> None:
+        file, content, written = self._files[table], self._content[table], self._written[table]
+        size = file.stat().st_size if file.exists() else 0
+        if size != written:  # somebody has changed it
+            write_whole(file, content)
+        elif len(content) > written:
+            try:
+                with file.open("ab") as opened:
+                    opened.write(content[written:])
+            except OSError:
+                with contextlib.suppress(OSError):
+                    os.truncate(file, written)  # no half row
+                raise
+        self._written[table] = len(content)
 
 
 def _counters(env_steps: int, decision_steps: int, updates: int, wall_time_s: float) -> dict[str, float]:
