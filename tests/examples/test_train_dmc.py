@@ -31,7 +31,7 @@ SMALL_RUN = (
     "reanalyze.iterations=1 optim.batch_size=4 replay.seed_decisions=40 replay.pretrain_updates=4"
 ).split()
 
-PARTS = ("agent", "collector", "sampler", "reanalyze", "learner", "log", "state", "random")
+PARTS = ("agent", "best", "collector", "sampler", "reanalyze", "learner", "log", "state", "random")
 
 
 def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -90,8 +90,8 @@ def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(fini
         "curve.png",
         "checkpoints/last.pt",
         "checkpoints/best.pt",
-        *(f"checkpoints/resume/000000000120/{name}.pt" for name in PARTS),
-        "checkpoints/resume/000000000120/manifest.json",
+        *(f"checkpoints/resume/{step:012d}/{name}.pt" for name in PARTS for step in (0, 120)),
+        *(f"checkpoints/resume/{step:012d}/manifest.json" for step in (0, 120)),
     }
     files = set(file_hashes(directory))
     replay = {name for name in files if name.startswith("runs/first/checkpoints/replay/")}
@@ -145,7 +145,9 @@ def test_the_same_run_directory_is_refused_and_not_touched(finished, run_script)
     assert again.returncode == 1
     assert again.stdout == ""
     run_dir = Path("runs", "first")
-    expected = f"error: run_dir={run_dir} already holds a run; choose another run_dir or remove it.\n"
+    expected = (
+        f"error: run_dir={run_dir} already holds a run; go on with resume=auto, choose another run_dir or remove it.\n"
+    )
     assert again.stderr == expected
     assert file_hashes(directory) == before
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import pickle
 import random
@@ -14,6 +15,8 @@ from torch import Tensor
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import (
     Agent,
+    AgentFile,
+    BestAgent,
     CheckpointError,
     TrainConfig,
     build_agent,
@@ -178,7 +181,7 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path, saved, share):
     path.write_bytes(content[: int(share * len(content))])
     message = refusal(path)
     assert message.startswith("is not a readable checkpoint (")
-    assert message.endswith("it is cut off, damaged or another kind of file; use another checkpoint.")
+    assert message.endswith("cut off, damaged or another kind); use another checkpoint.")
 
 
 def test_random_bytes_are_refused_without_a_warning(tmp_path, recwarn):
@@ -315,3 +318,75 @@ def test_an_agent_file_with_a_task_in_code_asks_for_it_on_the_command_line(tmp_p
     path = edited(saved, tmp_path / "user.pt", config={**saved[2].to_dict(), "task": "os:getcwd"})
     message = refusal(path, load_agent)
     assert "task 'os:getcwd' names code, which must be given on the command line: task=os:getcwd" in message
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("config", [1], "is not a checkpoint: its config is of type list, not dict."),
+        ("observation_dim", "5", "is not a checkpoint: its observation_dim is of type str, not int."),
+        ("world_model", 3, "is not a checkpoint: its world_model is of type int, not Mapping."),
+        ("loss", {"scale": 1.0}, "is not a checkpoint: scale is no tensor but of type float."),
+        ("loss", {"scale": torch.tensor(math.nan)}, "cannot be used: scale holds numbers that are not finite."),
+        ("world_model", {}, "does not fit its own configuration ("),
+        ("updater", {}, "does not fit its own configuration ("),
+        ("updater", {"optimizer": {"state": 3}}, "does not fit its own configuration ("),
+    ],
+)
+def test_what_is_wrong_inside_a_file_is_named_before_it_is_used(tmp_path, saved, name, value, message):
+    path = edited(saved, tmp_path / "odd.pt", **{name: value})
+    assert refusal(path, load_agent).startswith(message)
+
+
+def test_a_flipped_bit_is_noticed_or_changes_nothing(tmp_path, saved):
+    data, generator, path = saved[0].read_bytes(), random.Random(0), tmp_path / "flipped.pt"
+    before, noticed = read_agent_file(saved[0])["world_model"], 0
+    for _ in range(100):
+        flipped = bytearray(data)
+        flipped[generator.randrange(len(data))] ^= 1 << generator.randrange(8)
+        path.write_bytes(flipped)
+        try:
+            content = read_agent_file(path)
+        except CheckpointError:
+            noticed += 1
+            continue
+        assert content["counters"] == COUNTERS
+        assert all(torch.equal(content["world_model"][key], before[key]) for key in content["world_model"])
+    assert noticed > 50
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a huge file"])
+def test_what_cannot_be_an_agent_is_refused_before_it_is_read(tmp_path, kind):
+    path = tmp_path / "last.pt"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    else:
+        with path.open("wb") as file:
+            file.truncate(2**43)  # takes no space
+    assert refusal(path).startswith("is not a readable checkpoint (it ")
+
+
+def test_the_best_agent_is_the_one_that_was_evaluated_best(tmp_path, saved, small_disk, leave_free):
+    _, agent, config = saved
+    step = [0]
+    path = small_disk / "checkpoints" / "best.pt"
+    best = BestAgent(AgentFile(agent, config, lambda: {"env_steps": step[0]}), path)
+    for value, kept in ((3.0, 1), (2.0, 1), (5.0, 3), (5.0, 4), (math.nan, 4)):
+        step[0] += 1
+        best.note(value)
+        assert load_agent(path)[2] == {"env_steps": kept}  # of two alike the later one
+    leave_free(small_disk, 0)
+    with pytest.warns(UserWarning, match=r"best\.pt cannot be written \(No space left on device\); it is tried again"):
+        best.note(6.0)
+    step[0] += 1
+    leave_free(small_disk, None)
+    best.write()
+    assert load_agent(path)[2] == {"env_steps": 5}  # not what the agent has become
+    state = best.state_dict()
+    best.note(7.0)
+    again = BestAgent(best.agent, tmp_path / "other" / "best.pt")
+    again.load_state_dict(state)
+    assert again.path.read_bytes() != path.read_bytes()
+    assert load_agent(again.path)[2] == {"env_steps": 5}
+    again.note(5.5)
+    assert load_agent(again.path)[2] == {"env_steps": 5}

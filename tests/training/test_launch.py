@@ -13,7 +13,7 @@ import pytest
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
+from torchrl_etdmpc.checkpoints import CheckpointStore
 from torchrl_etdmpc.collectors import StepCollector
 from torchrl_etdmpc.envs import Task, register_task
 from torchrl_etdmpc.runs import RunDirectory, RunLog
@@ -21,10 +21,12 @@ from torchrl_etdmpc.training import (
     RunInterrupted,
     TrainConfig,
     TrainingRun,
+    build_agent,
     launch,
     plan_launch,
     read_run_config,
     resumed_config,
+    save_agent,
 )
 
 EPISODE = 20  # decisions
@@ -48,8 +50,8 @@ def begin(config: TrainConfig) -> RunDirectory:
     return directory
 
 
-def save(directory: RunDirectory) -> None:
-    CheckpointStore(directory.checkpoints).save(80, {}, TensorDictReplayBuffer(storage=LazyTensorStorage(10)))
+def save(directory: RunDirectory, step: int = 80) -> None:
+    CheckpointStore(directory.checkpoints).save(step, {}, TensorDictReplayBuffer(storage=LazyTensorStorage(10)))
 
 
 def finish(directory: RunDirectory, config: TrainConfig) -> None:
@@ -80,14 +82,13 @@ def test_going_on_where_there_is_nothing_is_refused(command):
         plan(command(resume="on"))
 
 
-@pytest.mark.parametrize("state", ["begun", "saved", "finished"])
+@pytest.mark.parametrize("state", ["saved", "finished"])
 def test_a_run_that_is_there_is_never_written_over(command, state):
     directory = begin(command())
-    if state != "begun":
-        save(directory)
+    save(directory)
     if state == "finished":
         finish(directory, command())
-    with pytest.raises(FileExistsError, match=r"^run_dir=.* already holds a run; choose another run_dir or remove it"):
+    with pytest.raises(FileExistsError, match=r"^run_dir=.* already holds a run; go on with resume=auto, "):
         plan(command(resume="off"))
 
 
@@ -101,10 +102,14 @@ def test_tables_without_a_configuration_are_not_written_over_either(command, res
         plan(command(resume=resume))
 
 
-@pytest.mark.parametrize(("resume", "action"), [("on", "resume"), ("auto", "start over")])
-def test_a_run_that_ended_before_its_first_checkpoint_starts_over_if_it_may(command, resume, action):
-    begin(command())
-    assert plan(command(resume=resume))[0] == action
+@pytest.mark.parametrize("resume", ["off", "on", "auto"])
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_run_that_made_no_step_is_begun_again_as_the_command_says(command, resume, saved):
+    directory = begin(command())
+    if saved:
+        save(directory, 0)
+    asked = command(resume=resume, planner={"horizon": 3})
+    assert plan(asked, "planner.horizon") == ("begin", asked)
 
 
 @pytest.mark.parametrize("resume", ["on", "auto"])
@@ -134,12 +139,15 @@ def test_a_finished_run_goes_on_with_a_larger_budget(command, resume):
 
 
 @pytest.mark.parametrize("resume", ["on", "auto"])
-def test_a_finished_run_without_checkpoints_keeps_its_results(command, resume):
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_run_without_checkpoints_keeps_its_results(command, resume, finished):
     directory = begin(command())
-    finish(directory, command())
-    with pytest.raises(FileNotFoundError, match=r"is finished and its checkpoints are gone, .* remove this one to tra"):
+    if finished:
+        finish(directory, command())
+    else:
+        directory.eval.write_text("env_steps,return_mean\n0,1.0\n40,2.0\n")
+    with pytest.raises(FileNotFoundError, match=r"holds results but no checkpoint to go on from; choose another run"):
         plan(command(resume=resume, total_env_steps=161), "total_env_steps")
-    assert directory.finished
 
 
 def test_a_command_changes_what_may_change_and_nothing_that_it_does_not_name(command):
@@ -170,7 +178,7 @@ def test_a_changed_setting_is_checked_with_the_others(command):
 def test_a_configuration_of_something_else_is_refused_in_one_line(command, text):
     directory = begin(command())
     directory.config.write_text(text)
-    with pytest.raises(ValueError, match=r"config\.yaml is not a configuration") as caught:
+    with pytest.raises(ValueError, match=r"config\.yaml (is not a configuration|cannot be used): ") as caught:
         plan(command(resume="auto"))
     assert "\n" not in str(caught.value)
 
@@ -290,17 +298,27 @@ def test_others_are_kept_out_while_it_trains_and_let_in_however_it_ends(command,
     with pytest.raises(error, match="enough"):
         launch(command())
     assert free == [False]
-    assert is_free(directory)
-    assert plan(command(resume="auto"))[0] == "start over"
+    assert not directory.path.exists()  # no step was made, so nothing stays
 
 
-@needs_dm_control
-def test_going_on_without_a_checkpoint_is_refused_and_changes_nothing(command, process):
+@pytest.mark.parametrize("how", ["changed", "missing", "cut off", "a pipe"])
+def test_a_damaged_configuration_is_taken_from_the_weights(command, tiny_config, how):
     directory = begin(command())
-    with pytest.raises(CheckpointError, match="^cannot resume: there is no checkpoint under"):
-        launch(command(resume="on"))
-    assert plan(command(resume="auto"))[0] == "start over"
-    assert is_free(directory)
+    agent = build_agent(command(), observation_dim=5, action_dim=1)
+    save_agent(directory.last_agent, agent, command(), {"env_steps": 80})
+    save(directory)
+    text = directory.config.read_text()
+    directory.config.unlink()
+    if how == "a pipe":
+        os.mkfifo(directory.config)
+    elif how != "missing":
+        directory.config.write_text(text.replace("horizon: 2", "horizon: 3") if how == "changed" else text[:-20])
+    with pytest.warns(UserWarning, match=r"config.*; the settings are those of .*last\.pt\.$"):
+        assert plan(command(resume="on")) == ("resume", command())
+    directory.last_agent.unlink()
+    if how != "missing":
+        with pytest.raises(ValueError, match=r"config\.yaml is not a configuration: "):
+            plan(command(resume="auto"))
 
 
 class Killed(BaseException):
@@ -324,15 +342,45 @@ def kill() -> None:
 
 
 @needs_dm_control
-def test_a_run_that_starts_over_forgets_its_rows(command, monkeypatch, process, read_table):
+@pytest.mark.parametrize("number", [1, 20])
+def test_a_run_that_was_killed_before_its_first_interval_ends_the_same(
+    command, monkeypatch, process, read_table, number
+):
     with monkeypatch.context() as patched:
-        at_decision(patched, 20, kill)
+        at_decision(patched, number, kill)
         with pytest.raises(Killed):
             launch(command())
     directory = RunDirectory(command().run_dir)
-    assert [row["env_steps"] for row in read_table(directory.eval)] == [0]
+    assert directory.path.exists() == (number > 1)
     launch(command(resume="auto"))
     assert [row["env_steps"] for row in read_table(directory.eval)] == [0, 100, 160]
+
+
+@needs_dm_control
+@pytest.mark.parametrize("place", ["make_env", "precompile", "_train"])
+def test_a_signal_before_the_first_step_leaves_nothing_behind(command, tmp_path, monkeypatch, process, place):
+    owner = TrainingRun if place == "precompile" else importlib.import_module("torchrl_etdmpc.training.launch")
+    original = getattr(owner, place)
+
+    def interrupted(*args: Any, **kwargs: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, place, interrupted)
+    with pytest.raises(RunInterrupted, match=r"^stopped before the first step, with nothing to save; start it ag"):
+        launch(command())
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_dm_control
+def test_an_error_before_the_first_step_leaves_nothing_behind(command, tmp_path, monkeypatch, process):
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError("this machine has no compiler")
+
+    monkeypatch.setattr(TrainingRun, "precompile", fail)
+    with pytest.raises(RuntimeError, match="no compiler"):
+        launch(command())
+    assert list(tmp_path.iterdir()) == []
 
 
 @needs_dm_control

@@ -26,6 +26,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     TrainingRun,
     build_replay,
     load_agent,
+    read_agent_file,
     read_run_config,
     resumed_config,
 )
@@ -120,7 +121,7 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, st
     run = make_run(config, tmp_path)
     find, call = PLACES[place]
     stop_at(run, *find(run), call)
-    with pytest.raises(RunInterrupted, match=r"^stopped at \d+ env steps and saved in .*; go on with resume=true\.$"):
+    with pytest.raises(RunInterrupted, match=r"^stopped (before the first step|at \d+ env steps and saved in )"):
         run.run()
     run.log.directory.close()
     resumed = make_run(config, tmp_path, resume=True)
@@ -247,7 +248,7 @@ def test_without_any_checkpoint_the_error_says_so(tmp_path, small_config, make_r
     directory = RunDirectory(tmp_path)
     directory.begin(config.to_dict())
     directory.close()
-    with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\.$"):
+    with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\. If the"):
         make_run(config, tmp_path, resume=True)
 
 
@@ -276,7 +277,6 @@ def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, mak
         "stage": "learn",
         "due": ["evaluation", "train_row", "checkpoint"],
         "eval_returns": [1e6],
-        "best_saved": 1e6,
         "learning_s": 2.0,
         "wall_s": 3.0,
     }
@@ -425,22 +425,94 @@ def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(small_d
     assert results(resumed, run_dir) == straight(config)
 
 
-def test_best_and_last_follow_the_first_checkpoint_that_a_full_disk_lets_through(small_disk, small_config, make_run):
-    run = make_run(small_config(), small_disk / "run")
-    for _ in range(30):
-        run.learner.step()
-    run.state.eval_returns = [1.0]
-    assert run.save()
-    run.state.eval_returns = [1.0, 2.0]
-    fill(small_disk)
-    with pytest.warns(UserWarning, match="no checkpoint at 60 env steps"):
-        assert not run.save()
-    best = small_disk / "run" / "checkpoints" / "best.pt"
-    before = best.stat().st_ino
+def test_a_run_whose_end_cannot_be_saved_is_not_finished(small_disk, straight, small_config, make_run):
+    config = small_config(checkpoint_every=30)
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    step, calls = run.learner.collector.act, [0]
+
+    def watched(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 50:
+            fill(small_disk)
+        return step(*args)
+
+    run.learner.collector.act = watched
+    expected = r"^run_dir=.* made its 140 env steps, but the end could not be saved \(No space left on device\), so "
+    with pytest.warns(UserWarning), pytest.raises(OSError, match=expected):
+        run.run()
+    assert not run.log.directory.finished
+    run.log.directory.close()
     (small_disk / "ballast").unlink()
-    run.state.eval_returns = [1.0, 2.0, 2.0]
-    assert run.save()
-    assert best.stat().st_ino != before
+    resumed = make_run(config, run_dir, resume=True)
+    assert resumed.env_steps == 90
+    resumed.run()
+    assert results(resumed, run_dir) == straight(config)
+
+
+def test_the_best_agent_is_the_uninterrupted_run_s(tmp_path, finished, small_config, make_run):
+    """Killed between the evaluation that wrote it and the next checkpoint, and its file lost."""
+    config = small_config(checkpoint_every=1000)
+    run = make_run(config, tmp_path)
+    calls = count(1)
+
+    def die(*_: Any) -> None:
+        if next(calls) == 40:
+            raise KeyboardInterrupt
+
+    act = run.learner.collector.act
+    run.learner.collector.act = lambda: (die(), act())[1]
+    with pytest.raises(KeyboardInterrupt):
+        run.run()
+    run.log.directory.close()
+    assert (tmp_path / "checkpoints" / "best.pt").exists()
+    run = make_run(config, tmp_path, resume=True)
+    assert run.env_steps == 0
+    run.run()
+    content = [read_agent_file(path / "checkpoints" / "best.pt") for path in (finished, tmp_path)]
+    assert content[0]["counters"]["updates"] == content[1]["counters"]["updates"]
+    for name, value in content[0]["loss"].items():
+        assert torch.equal(value, content[1]["loss"][name])
+    (tmp_path / "checkpoints" / "best.pt").unlink()
+    make_run(config, tmp_path, resume=True)
+    assert torch.equal(read_agent_file(tmp_path / "checkpoints" / "best.pt")["loss"][name], value)
+
+
+def test_a_damaged_buffer_can_be_gone_on_with_on_request(tmp_path, finished, small_config, make_run):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    (run_dir / "summary.json").unlink()
+    manifest = json.loads((run_dir / "checkpoints" / "resume" / f"{140:012d}" / "manifest.json").read_text())["replay"]
+    oldest = run_dir / "checkpoints" / "replay" / manifest["rows"][0]["file"]
+    data = bytearray(oldest.read_bytes())
+    data[len(data) // 2] ^= 1
+    oldest.write_bytes(data)
+    advice = r" is not the file that was written: .*\. If the weights are whole, resume=weights goes on"
+    with pytest.raises(CheckpointError, match=advice):
+        make_run(small_config(), run_dir, resume=True)
+    config = small_config(resume="weights", total_env_steps=160)
+    with pytest.warns(UserWarning, match=r"140 with its weights and 45 of 70 rows of its buffer; .*damaged\.$"):
+        run = make_run(config, run_dir, resume=True)
+    content = read_agent_file(run_dir / "checkpoints" / "last.pt")
+    assert all(torch.equal(value, content["loss"][name]) for name, value in run.learner.agent.loss.state_dict().items())
+    assert (run.env_steps, len(run.learner.replay)) == (140, 45)
+    run.run()
+    assert (run.env_steps, len(run.learner.replay)) == (160, 55)
+    stored = run.learner.replay[:]
+    assert stored["collector", "traj_ids"][44] < stored["collector", "traj_ids"][45]  # a fresh episode
+    run.log.directory.close()
+    resumed = make_run(config, run_dir, resume=True)  # and whole again
+    assert (stored == resumed.learner.replay[:]).all()
+
+
+def test_too_little_of_a_buffer_is_refused(tmp_path, finished, small_config, make_run):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    for file in (run_dir / "checkpoints" / "replay").glob("rows*"):
+        file.write_bytes(b"")
+    with (
+        pytest.warns(UserWarning, match="and 0 of 70 rows"),
+        pytest.raises(CheckpointError, match=r"^cannot resume: 0 rows of the buffer are left, fewer than the 24 "),
+    ):
+        make_run(small_config(resume="weights"), run_dir, resume=True)
 
 
 def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(small_disk, small_config, make_run):

@@ -19,6 +19,7 @@ pytest.importorskip("dm_control")
 from torchrl_etdmpc.collectors import NonFiniteError  # noqa: E402
 from torchrl_etdmpc.envs import make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
+    EvaluationResult,
     TrainConfig,
     TrainingRun,
     build_agent,
@@ -169,21 +170,20 @@ def test_no_evaluation_and_no_checkpoint_is_jumped_over_by_several_environments(
     # Steps of 6; the 40 is in the random phase, which ends at 60.
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 84, 120, 162]
     checkpoints = sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir())
-    assert checkpoints == [102, 150, 162]
+    assert checkpoints == [0, 102, 150, 162]
     assert [row["env_steps"] for row in read_table(tmp_path / "train.csv")] == [84, 120, 162]
 
 
-def test_the_best_checkpoint_is_the_one_after_the_best_evaluation(tmp_path, tiny_config, make_run):
-    run = make_run(tiny_config(), tmp_path)
-    saved = {"best.pt": [], "last.pt": []}
-    for value in (3.0, 2.0, 5.0, 5.0, 4.0):
+def test_the_best_agent_is_written_when_it_was_evaluated(tmp_path, monkeypatch, tiny_config, make_run):
+    run = make_run(tiny_config(checkpoint_every=10_000), tmp_path)
+    results, kept = iter((3.0, 2.0, 5.0)), []
+    monkeypatch.setattr(run, "evaluator", lambda **_: EvaluationResult(next(results), 0.0, 1, 0.0))
+    for _ in range(3):
         run.learner.step()
-        run.state.eval_returns.append(value)
-        assert run.save()
-        for name, decisions in saved.items():
-            _, _, counters = load_agent(tmp_path / "checkpoints" / name)
-            decisions.append(counters["decision_steps"])
-    assert saved == {"best.pt": [1, 1, 3, 4, 4], "last.pt": [1, 2, 3, 4, 5]}  # of two alike the later one
+        run.evaluate()
+        kept.append(load_agent(tmp_path / "checkpoints" / "best.pt")[2]["decision_steps"])
+    assert kept == [1, 1, 3]
+    assert not (tmp_path / "checkpoints" / "last.pt").exists()  # no checkpoint was due
 
 
 def test_a_checkpoint_is_written_when_the_last_one_is_some_minutes_old(tmp_path, monkeypatch, tiny_config, make_run):
@@ -202,14 +202,14 @@ def test_a_checkpoint_is_written_when_the_last_one_is_some_minutes_old(tmp_path,
     run.learner.collector.act = slow
     run.run()
     checkpoints = sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir())
-    assert checkpoints == [20, 40, 60, 80, 100, 120, 140, 160]
+    assert checkpoints == [0, 20, 40, 60, 80, 100, 120, 140, 160]
 
 
 def test_without_minutes_only_the_interval_asks_for_a_checkpoint(tmp_path, monkeypatch, tiny_config, make_run):
     clock = itertools.count(step=1e6)
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
     make_run(tiny_config(checkpoint_minutes=None, checkpoint_keep=99, total_env_steps=90), tmp_path).run()
-    assert sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir()) == [80, 90]
+    assert sorted(int(folder.name) for folder in (tmp_path / "checkpoints" / "resume").iterdir()) == [0, 80, 90]
 
 
 def test_every_decision_after_the_seed_phase_is_stored_with_a_planner_s_target(finished):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import os
 import shutil
 import stat
@@ -16,6 +17,7 @@ from torchrl_etdmpc.runs.files import DamagedFileError, read_whole, write_whole
 
 _LOCK = ".lock"
 _CONFIG_BYTES = 2**20
+_SEAL = "# what this run trains with, as it was written: sha256 "
 
 
 class RunDirectory:
@@ -94,6 +96,9 @@ class RunDirectory:
             raise FileNotFoundError(f"run_dir={self} holds no run to go on with; start it with resume=off.")
         try:
             text = read_whole(self.config, _CONFIG_BYTES).decode()
+            first, _, rest = text.partition("\n")
+            if first.startswith(_SEAL) and first != _SEAL + _digest(rest):
+                raise ValueError("it is not what the run wrote; settings are changed on the command line")
             if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):  # few bytes can mean gigabytes
                 raise ValueError("it refers to itself")
             return yaml.safe_load(text)
@@ -264,8 +269,13 @@ def _to_yaml(config: Mapping[str, Any]) -> str:
     except ImportError as error:
         raise ImportError("config.yaml needs PyYAML, which is not installed; run `pip install pyyaml`.") from error
     try:
-        return yaml.safe_dump(dict(config), sort_keys=False)
+        text = yaml.safe_dump(dict(config), sort_keys=False)
     except yaml.YAMLError as error:
         raise ValueError(
             f"config must hold plain dicts, lists, numbers and strings, got {error.args[-1]!r}; convert it first."
         ) from error
+    return f"{_SEAL}{_digest(text)}\n{text}"
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

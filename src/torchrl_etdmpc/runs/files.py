@@ -62,13 +62,16 @@ def read_whole(path: Path, limit: int | None = None) -> bytes:
     limit = most if limit is None else min(limit, most)
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe without a writer would wait
-        with open(descriptor, "rb") as file:
+        try:
             status = os.fstat(descriptor)
             if not stat.S_ISREG(status.st_mode):
                 raise DamagedFileError(f"{path} is not a regular file.")
             if status.st_size > limit:
                 raise DamagedFileError(f"{path} has {status.st_size:,} bytes; at most {limit:,} are read.")
-            return file.read()
+            with open(descriptor, "rb", closefd=False) as file:
+                return file.read()
+        finally:
+            os.close(descriptor)
     except OSError as error:
         raise DamagedFileError(f"{path} cannot be read ({error.strerror}).") from error
 
@@ -80,15 +83,20 @@ def _memory() -> int:
         return 2**34
 
 
+def pack_tensors(content: Any) -> bytes:
+    """Tensors and plain containers as the content of a file."""
+    memory = io.BytesIO()  # torch.save itself answers a full disk with an error that does not say so
+    torch.save(content, memory)
+    return memory.getvalue()
+
+
 def write_tensors(path: Path, content: Any) -> dict[str, Any]:
     """Writes tensors and plain containers with :func:`write_whole`.
 
     Returns:
         dict: its ``size`` in bytes and its ``sha256``, without which :func:`read_tensors` reads nothing.
     """
-    memory = io.BytesIO()  # torch.save itself answers a full disk with an error that does not say so
-    torch.save(content, memory)
-    data = memory.getbuffer()
+    data = pack_tensors(content)
     write_whole(path, data)
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,12 +11,27 @@ from typing import Any
 import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError
-from torchrl_etdmpc.runs.files import write_tensors
+from torchrl_etdmpc.runs.files import (
+    DamagedFileError,
+    load_tensors,
+    pack_tensors,
+    read_whole,
+    write_tensors,
+    write_whole,
+)
 from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
 FORMAT = 2
-_ENTRIES = {"config", "observation_dim", "action_dim", "world_model", "loss", "updater", "counters"}
+_ENTRIES = {
+    "config": dict,
+    "observation_dim": int,
+    "action_dim": int,
+    "world_model": Mapping,
+    "loss": Mapping,
+    "updater": dict,
+    "counters": dict,
+}
 
 
 class AgentFile:
@@ -48,6 +64,47 @@ class AgentFile:
         self.agent.load_state_dict(state_dict)
 
 
+class BestAgent:
+    """The agent of the best evaluation so far: a file from the moment of that evaluation, and a part of checkpoints.
+
+    Args:
+        agent (AgentFile): the agent that trains.
+        path (Path): the file.
+    """
+
+    def __init__(self, agent: AgentFile, path: Path) -> None:
+        self.agent, self.path = agent, path
+        self.return_mean = -math.inf
+        self._content, self._written = b"", True
+
+    def note(self, return_mean: float) -> None:
+        """Keeps the agent as it is now, unless an earlier one was better."""
+        if return_mean >= self.return_mean:
+            self.return_mean, self._content, self._written = return_mean, pack_tensors(self.agent.state_dict()), False
+            self.write()
+
+    def write(self) -> None:
+        """Writes the file if it is not there yet; a disk that does not take it is a warning."""
+        if self._written:
+            return
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(self.path, self._content)
+            self._written = True
+        except OSError as error:
+            warnings.warn(f"{self.path} cannot be written ({error.strerror}); it is tried again later.", stacklevel=2)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The file's content, and the return of its evaluation."""
+        return {"return_mean": self.return_mean, "file": torch.tensor(memoryview(self._content), dtype=torch.uint8)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores :meth:`state_dict`, and the file if it holds something else by now."""
+        self.return_mean, self._content = state_dict["return_mean"], state_dict["file"].numpy().tobytes()
+        self._written = not self._content
+        self.write()
+
+
 def save_agent(path: str | Path, agent: Agent, config: TrainConfig, counters: Mapping[str, int | float]) -> Path:
     """Writes an agent file; it is there whole or not at all.
 
@@ -73,24 +130,33 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
         CheckpointError: if the file is missing, is not an agent file or has another format.
     """
     path = Path(path).expanduser()
-    if not path.is_file():
+    if not path.exists() or path.is_dir():
         raise CheckpointError(f"{path} is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what the bytes of a damaged file happen to look like
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # damaged files raise errors of a dozen types, whose texts advise to run the file's code
-        raise CheckpointError(
-            f"{path} is not a readable checkpoint ({type(error).__name__}): it is cut off, damaged or another kind of "
-            "file; use another checkpoint."
-        ) from error
+            content = load_tensors(read_whole(path), path)
+    except DamagedFileError as error:
+        what = str(error).removeprefix(f"{path} ").rstrip(".")
+        raise CheckpointError(f"{path} is not a readable checkpoint (it {what}); use another checkpoint.") from error
     if not isinstance(content, dict) or "format" not in content or "world_model" not in content:
         raise CheckpointError(f"{path} is a PyTorch file but not a checkpoint of torchrl_etdmpc.")
     if content["format"] != FORMAT:
         raise CheckpointError(f"{path} has checkpoint format {content['format']}; this version reads format {FORMAT}.")
-    missing = sorted(_ENTRIES - content.keys())
+    missing = sorted(_ENTRIES.keys() - content.keys())
     if missing:
         raise CheckpointError(f"{path} is not a whole checkpoint: it lacks {', '.join(missing)}.")
+    for name, kind in _ENTRIES.items():
+        if not isinstance(content[name], kind):
+            found = type(content[name]).__name__
+            raise CheckpointError(f"{path} is not a checkpoint: its {name} is of type {found}, not {kind.__name__}.")
+    for name, value in (*content["world_model"].items(), *content["loss"].items()):
+        if not isinstance(value, torch.Tensor):
+            raise CheckpointError(
+                f"{path} is not a checkpoint: {name} is no tensor but of type {type(value).__name__}."
+            )
+        if value.is_floating_point() and not value.isfinite().all():
+            raise CheckpointError(f"{path} cannot be used: {name} holds numbers that are not finite.")
     return content
 
 
@@ -134,7 +200,7 @@ def load_agent(
         config = TrainConfig.from_dict(values)
         agent = build_agent(config, *saved, device=device)
         agent.load_state_dict(content)
-    except (RuntimeError, ValueError, KeyError) as error:
+    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:160]
         raise CheckpointError(f"{path} does not fit its own configuration ({reason}).") from error
     return agent, config, content["counters"]

@@ -172,8 +172,9 @@ class TrainConfig:
     """Updates in a row without a finite gradient, which are skipped, before the run stops."""
     checkpoint_keep: int = 2
     """Checkpoints to go on from that are kept."""
-    resume: Literal["off", "on", "auto"] = "off"
-    """``on`` (or ``true``) goes on from the run directory's newest checkpoint, ``auto`` does if there is one."""
+    resume: Literal["off", "on", "auto", "weights"] = "off"
+    """``on`` (or ``true``) goes on from the run directory's newest checkpoint, ``auto`` does if there is one;
+    ``weights`` does with the weights and what is left of the buffer if no checkpoint is whole."""
     threads: int | None = None
     """CPU threads of PyTorch. Default: PyTorch's own choice."""
     model: ModelConfig = field(default_factory=ModelConfig)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any, Literal
 
 import torch
 
-from torchrl_etdmpc.checkpoints import CheckpointStore
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
+from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.train import TrainingRun
 
 CHANGEABLE = {
@@ -38,13 +41,13 @@ class Launch:
     Attributes:
         config (TrainConfig): the command's, or the stored one with what the command changes.
         directory (RunDirectory): of the run.
-        action (str): ``"begin"`` a new run; ``"resume"`` from the newest checkpoint; ``"start over"`` a run that ended
-            before its first one; ``"nothing"`` to do, it is finished.
+        action (str): ``"begin"`` a new run, also where one ended before its first step; ``"resume"`` from the newest
+            checkpoint; ``"nothing"`` to do, it is finished.
     """
 
     config: TrainConfig
     directory: RunDirectory
-    action: Literal["begin", "resume", "start over", "nothing"]
+    action: Literal["begin", "resume", "nothing"]
 
 
 def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
@@ -56,26 +59,26 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
 
     Raises:
         FileExistsError: if the directory holds a run and ``resume`` is off.
-        FileNotFoundError: if there is no run to go on with and ``resume`` is on, or a finished run without checkpoints
-            is to go on.
+        FileNotFoundError: if there is no run to go on with and ``resume`` is on, or a run with results has no
+            checkpoint to go on from.
         ValueError: if the command names a setting with another value than the run's, and it may not change.
     """
     name = config.task.replace(":", ".")
     directory = RunDirectory(config.run_dir or Path("runs", name, config.preset, f"seed{config.seed}"))
-    saved = CheckpointStore(directory.checkpoints).exists()
-    if config.resume == "off" or (config.resume == "auto" and not saved and not directory.config.exists()):
+    there = directory.config.exists() or directory.last_agent.exists()
+    if directory.leftover or config.resume == "off" or (config.resume == "auto" and not there):
         directory.require_new()
         return Launch(config, directory, "begin")
     stored = read_run_config(directory)
     merged = resumed_config(stored, config, explicit)
     if directory.finished and merged.total_env_steps <= stored.total_env_steps:
         return Launch(merged, directory, "nothing")
-    if directory.finished and not saved:  # starting over would remove the results of a whole run
+    if not CheckpointStore(directory.checkpoints).exists():  # starting over would remove results
         raise FileNotFoundError(
-            f"run_dir={directory} is finished and its checkpoints are gone, so that it cannot go on; choose another "
-            "run_dir, or remove this one to train again."
+            f"run_dir={directory} holds results but no checkpoint to go on from; choose another run_dir, or remove "
+            "this one to train again."
         )
-    return Launch(merged, directory, "resume" if saved or config.resume == "on" else "start over")
+    return Launch(merged, directory, "resume")
 
 
 def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
@@ -91,16 +94,31 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         str: one line on what came out.
 
     Raises:
-        RunInterrupted: if a signal asked the run to stop; it is saved.
-        ValueError, OSError, RuntimeError: if something is wrong with the command or its directory; nothing is left
-            behind.
+        RunInterrupted: if a signal asked the run to stop; the text says whether it is saved.
+        ValueError, OSError, RuntimeError: if something is wrong with the command or its directory. A run that made no
+            step leaves nothing behind.
     """
     plan = plan_launch(config, explicit)
-    config, directory = plan.config, plan.directory
     if plan.action == "nothing":
-        return f"{directory} is finished; nothing to do"
-    require_logger(config.logger)
-    resolve_device(config.device)
+        return f"{plan.directory} is finished; nothing to do"
+    require_logger(plan.config.logger)
+    resolve_device(plan.config.device)
+    with StopSignals() as stop:
+        try:
+            summary = _train(plan, stop)
+        except SystemExit:
+            if not stop.requested:
+                raise
+            state = "with nothing to save" if plan.action == "begin" else f"{plan.directory} is as it was"
+            raise RunInterrupted(f"stopped before the first step, {state}; start it again.") from None
+    return (
+        f"{plan.config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
+        f"{summary['wall_time_s']:.0f} s; curve, tables and checkpoint are in {plan.directory}"
+    )
+
+
+def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
+    config, directory = plan.config, plan.directory
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     torch.set_float32_matmul_precision("high")
@@ -111,7 +129,7 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)
         stack.callback(eval_env.close, raise_if_closed=False)
         log = RunLog(directory, total_env_steps=config.total_env_steps)
-        run = TrainingRun(config, env=env, eval_env=eval_env, log=log)  # before the directory: settings may be wrong
+        run = TrainingRun(config, env=env, eval_env=eval_env, log=log, stop=stop)  # may find that settings are wrong
         if plan.action == "begin":
             directory.begin(config.to_dict())
         else:
@@ -120,35 +138,36 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         stack.callback(log.close)
         try:
             log.logger = make_logger(config.logger, directory, config.to_dict())
+            if plan.action == "resume":
+                run.resume()  # before anything of the run is changed: it may not be possible
+            directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
+            directory.write_config(config.to_dict())
+            return run.run()
         except BaseException:
-            if plan.action == "begin":
+            if plan.action == "begin" and not run.env_steps:
                 directory.abandon()
             raise
-        if plan.action == "resume":
-            run.resume()  # before anything of the run is changed: it may not be possible
-        elif plan.action == "start over":
-            log.start_over()
-        directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
-        directory.write_config(config.to_dict())
-        summary = run.run()
-    return (
-        f"{config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
-        f"{summary['wall_time_s']:.0f} s; curve, tables and checkpoint are in {directory}"
-    )
 
 
 def read_run_config(directory: RunDirectory) -> TrainConfig:
-    """The configuration in a run directory.
+    """The configuration in a run directory; if that file is damaged, what its newest weights were trained with.
 
     Raises:
         FileNotFoundError: if there is none.
         ValueError: if it is not a configuration of this version.
     """
-    values = directory.read_config()
+    try:
+        values = directory.read_config()
+    except (ValueError, FileNotFoundError) as error:
+        try:
+            values = read_agent_file(directory.last_agent)["config"]
+        except CheckpointError:
+            raise error from None
+        warnings.warn(f"{str(error).rstrip('.')}; the settings are those of {directory.last_agent}.", stacklevel=2)
     try:
         return TrainConfig.from_dict(values)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{directory.config} is not a configuration of this version: {error}") from error
+        raise ValueError(f"{directory.config} cannot be used: {error}") from error
 
 
 def resumed_config(saved: TrainConfig, asked: TrainConfig, explicit: Iterable[str]) -> TrainConfig:

@@ -19,15 +19,13 @@ class RunState:
         stage (str): ``"random"`` phase, then ``"pretrain"``, then ``"learn"``.
         due (list of str): what the last step called for and is not done yet, in order. These names are stored.
         eval_returns (list of float): mean return of every evaluation so far.
-        best_saved (float): latest evaluation before the best checkpoint.
         learning_s (float): seconds of acting and updating, without random phase, pretraining and evaluations.
         wall_s (float): seconds of work before this process.
     """
 
     stage: Stage = "random"
-    due: list[Duty] = field(default_factory=lambda: ["evaluation"])
+    due: list[Duty] = field(default_factory=lambda: ["checkpoint", "evaluation"])
     eval_returns: list[float] = field(default_factory=list)
-    best_saved: float = float("-inf")
     learning_s: float = 0.0
     wall_s: float = 0.0
 

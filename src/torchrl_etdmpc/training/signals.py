@@ -16,13 +16,18 @@ _NAMES = ("SIGTERM", "SIGINT", "SIGUSR1")  # what SLURM and Kubernetes send, and
 
 
 class RunInterrupted(Exception):
-    """The run was asked to stop, and has been saved."""
+    """The run was asked to stop; the text says whether it is saved."""
 
 
 class StopSignals:
-    """Notes the first signal; a second one ends the process at once, and so does the first if there is nothing to save.
+    """Notes the first signal; a second one ends the process at once.
 
-    Only the main thread can handle signals; in another one this does nothing.
+    While there is nothing to save, the first one raises SystemExit, wherever the program is. Only the main thread can
+    handle signals; in another one this does nothing.
+
+    Attributes:
+        requested (bool): whether a signal has come.
+        nothing_to_save (bool): Default: ``True``.
 
     >>> with StopSignals() as stop:
     ...     stop.requested
@@ -31,7 +36,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.requested = False
-        self.nothing_to_save = False
+        self.nothing_to_save = True
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
@@ -54,7 +59,7 @@ class StopSignals:
         if self.requested:
             os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
             os._exit(128 + number)
+        self.requested = True
         if self.nothing_to_save:
             raise SystemExit(EXIT_CODE)
-        self.requested = True
         torchrl_logger.info(f"{name}: finishing this step, saving and stopping; send it again to stop at once")

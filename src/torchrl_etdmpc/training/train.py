@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,10 +14,10 @@ from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 
-from torchrl_etdmpc.checkpoints import CheckpointStore, Part
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, Part
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
-from torchrl_etdmpc.training.agent_file import AgentFile
+from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.evaluator import Evaluator
 from torchrl_etdmpc.training.learner import Learner
@@ -42,12 +43,15 @@ class TrainingRun:
         env (EnvBase): batch size [] or [config.num_envs]; closed at the end.
         eval_env (EnvBase): batch size [config.eval_episodes]; closed at the end.
         log (RunLog): the tables; its directory exists when :meth:`run` is called.
+        stop (StopSignals, optional): what is asked whether to stop. Default: nobody asks.
 
     Raises:
         ValueError: if a setting is out of range.
     """
 
-    def __init__(self, config: TrainConfig, *, env: EnvBase, eval_env: EnvBase, log: RunLog) -> None:
+    def __init__(
+        self, config: TrainConfig, *, env: EnvBase, eval_env: EnvBase, log: RunLog, stop: StopSignals | None = None
+    ) -> None:
         self.config, self.log = config, log
         self.learner = Learner(config, env)
         agent, collector = self.learner.agent, self.learner.collector
@@ -60,9 +64,12 @@ class TrainingRun:
         )
         self.store = CheckpointStore(log.directory.checkpoints, keep=config.checkpoint_keep)
         self.state = RunState()
-        self.stop = StopSignals()
+        self.stop = StopSignals() if stop is None else stop
+        file = AgentFile(agent, config, self.counters)
+        self.best = BestAgent(file, log.directory.best_agent)
         self.parts: dict[str, Part] = {
-            "agent": AgentFile(agent, config, self.counters),
+            "agent": file,
+            "best": self.best,
             "collector": collector,
             "sampler": self.learner.replay.sampler,
             **({} if self.learner.reanalyze is None else {"reanalyze": self.learner.reanalyze}),
@@ -71,7 +78,7 @@ class TrainingRun:
             "state": self.state,
             "random": GlobalRNGState(),  # last: restoring the others may draw from it
         }
-        self._compile_s, self._saved_at = 0.0, time.perf_counter()
+        self._compile_s, self._saved_at, self._saved_step = 0.0, time.perf_counter(), -1
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
 
     @property
@@ -91,11 +98,35 @@ class TrainingRun:
     def resume(self) -> None:
         """Goes on from the newest checkpoint in the run directory, exactly as if nothing had happened.
 
+        With ``resume=weights``, where no checkpoint is whole: from the newest weights and what is left of the buffer,
+        in a fresh episode.
+
         Raises:
-            CheckpointError: if there is none that is whole.
+            CheckpointError: if there is none to go on from.
         """
-        folder = self.store.load(self.parts, self.learner.replay)
+        try:
+            folder = self.store.load(self.parts, self.learner.replay)
+        except CheckpointError as error:
+            if self.config.resume != "weights":
+                raise CheckpointError(
+                    f"{error} If the weights are whole, resume=weights goes on with what is left of the buffer."
+                ) from error
+            folder = self._salvage()
+        self._saved_step = self.env_steps
         torchrl_logger.info(f"going on from {folder} ({self.env_steps} env steps)")
+
+    def _salvage(self) -> Path:
+        replay, collector = self.learner.replay, self.learner.collector
+        parts = {name: part for name, part in self.parts.items() if name != "sampler"}  # it follows the new rows
+        folder = self.store.salvage(parts, replay)
+        least = min(self.config.seed_decisions, collector.frames)
+        if len(replay) < least:
+            raise CheckpointError(
+                f"cannot resume: {len(replay)} rows of the buffer are left, fewer than the {least} that learning "
+                "begins with; start a new run."
+            )
+        collector.set_seed((self.config.seed + collector.frames) % 2**32)  # the buffer may end in another episode
+        return folder
 
     def run(self) -> dict[str, Any]:
         """Trains to the budget, draws the curve and writes the summary.
@@ -105,11 +136,11 @@ class TrainingRun:
 
         Raises:
             RunInterrupted: if a signal asked the run to stop; it is saved.
+            OSError: if the end cannot be saved: then the run is not finished, and goes on when there is room.
             NonFiniteError, SimulatorError: if environment, policy or updates keep failing; the run is saved first.
         """
         try:
-            with self.stop, progress_bar(self.config.total_env_steps, initial=self.env_steps) as progress:
-                self.stop.nothing_to_save = True
+            with progress_bar(self.config.total_env_steps, initial=self.env_steps) as progress:
                 self.precompile()
                 self.stop.nothing_to_save = False
                 self._do_what_is_due()
@@ -124,8 +155,19 @@ class TrainingRun:
             self.evaluator.close()
         summary = self.summary()
         _draw_curve(self.log.directory)
-        self.log.finish(summary)
+        self._finish(summary)
         return summary
+
+    def _finish(self, summary: dict[str, Any]) -> None:
+        try:
+            if self._saved_step != self.env_steps:
+                self._write_checkpoint()
+            self.log.finish(summary)
+        except OSError as error:
+            raise OSError(
+                f"run_dir={self.log.directory} made its {self.env_steps} env steps, but the end could not be saved "
+                f"({error.strerror}), so it is not finished; make room and go on with resume=auto."
+            ) from error
 
     def precompile(self) -> None:
         """Compiles what the run will call; see :func:`~torchrl_etdmpc.training.precompile.precompile`."""
@@ -192,6 +234,8 @@ class TrainingRun:
 
     def _stop_if_asked(self) -> None:
         if self.stop.requested:
+            if not self.env_steps:
+                raise RunInterrupted("stopped before the first step, with nothing to save; start it again.")
             saved = "saved" if self.save() else "not saved: the checkpoint before it stays"
             raise RunInterrupted(
                 f"stopped at {self.env_steps} env steps and {saved} in {self.log.directory}; go on with resume=true."
@@ -213,6 +257,7 @@ class TrainingRun:
             )
             return
         self.state.eval_returns.append(result.return_mean)
+        self.best.note(result.return_mean)
         row = result._asdict()
         if not self.config.eval_policy:
             del row["policy_return"]
@@ -232,20 +277,21 @@ class TrainingRun:
         Returns:
             bool: whether it was written.
         """
-        self._saved_at = time.perf_counter()
-        state, directory = self.state, self.log.directory
-        before, latest = state.best_saved, state.eval_returns[-1] if state.eval_returns else -math.inf
-        state.best_saved = max(latest, before)
-        links = {directory.last_agent: "agent"} | ({directory.best_agent: "agent"} if latest >= before else {})
-        version = int(self.learner.agent.world_model.version)
         try:
-            self.store.save(self.env_steps, self.parts, self.learner.replay, version=version, links=links)
+            self._write_checkpoint()
         except OSError as error:
-            state.best_saved = before
             reason = error.strerror or str(error)
             warnings.warn(f"no checkpoint at {self.env_steps} env steps ({reason}); training goes on.", stacklevel=2)
             return False
         return True
+
+    def _write_checkpoint(self) -> None:
+        self._saved_at = time.perf_counter()
+        self.best.write()
+        version = int(self.learner.agent.world_model.version)
+        links = {self.log.directory.last_agent: "agent"}
+        self.store.save(self.env_steps, self.parts, self.learner.replay, version=version, links=links)
+        self._saved_step = self.env_steps
 
     def summary(self) -> dict[str, Any]:
         """What the run came to."""
