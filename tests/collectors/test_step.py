@@ -28,7 +28,7 @@ from torchrl.envs import (
     TensorDictPrimer,
     TransformedEnv,
 )
-from torchrl.envs.utils import exploration_type
+from torchrl.envs.utils import RandomPolicy, exploration_type
 from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
 
 from torchrl_etdmpc import (
@@ -306,7 +306,7 @@ def test_what_is_stored_equals_an_independent_replay_of_the_actions(lengths):
 def test_a_gymnasium_task_is_stored_as_gymnasium_itself_plays_it():
     gymnasium = pytest.importorskip("gymnasium")
     env, replay = GymEnv("Pendulum-v1"), make_replay()
-    collector = StepCollector(env, SeedPolicy(env.action_spec), replay_buffer=replay, total_frames=230)
+    collector = StepCollector(env, RandomPolicy(env.action_spec), replay_buffer=replay, total_frames=230)
     collector.set_seed(5)
     for _ in collector:
         pass

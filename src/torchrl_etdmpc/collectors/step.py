@@ -59,7 +59,8 @@ class StepCollector(BaseCollector):
         policy_device (torch.device, optional): where the policy's inputs go. Default: the environment's device.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or the environment does not fit a planner's model
+            (:func:`~torchrl_etdmpc.envs.check_spaces`).
         NonFiniteError: while iterating, if an observation, a reward or an action is not finite. The step is not
             stored, the running episodes end at their last step, as truncated ones, and collection can go on with
             fresh ones.
@@ -340,11 +341,19 @@ def _truncate(rows: TensorDictBase) -> None:
 
 
 def _with_primer(env: EnvBase, policy: nn.Module) -> EnvBase:
-    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already."""
+    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already.
+
+    A primer that knows what its policy's model takes compares it with the environment first.
+    """
     make_primer = getattr(policy, "make_tensordict_primer", None)
-    if make_primer is None or not getattr(policy, "warm_start", True):
+    if make_primer is None:
         return env
     primer = make_primer()
+    check = getattr(primer, "check", None)
+    if check is not None:
+        check(env)
+    if not getattr(policy, "warm_start", True):
+        return env
     present = set(env.full_observation_spec.keys(True, True)) | set(env.full_state_spec.keys(True, True))
     if all(unravel_key(key) in present for key in primer.primers.keys(True, True)):
         return env
