@@ -18,6 +18,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import (
+    ActionScaling,
     Compose,
     EnvBase,
     ExplorationType,
@@ -607,6 +608,30 @@ def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
     assert min(fresh[TRAJ_KEY].tolist()) > max(used)
     for row in (steps[0] for steps in episodes(fresh).values()):
         assert row["observation"][1] == 0
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
+def test_a_collector_that_has_not_acted_can_be_saved_even_if_its_workers_rescale_actions(kind):
+    def make_collector() -> StepCollector:
+        env = kind(2, _make_rescaled)
+        return StepCollector(env, RandomPolicy(env.action_spec), replay_buffer=make_replay())
+
+    first, second = make_collector(), make_collector()
+    second.load_state_dict(first.state_dict())
+    second.act()
+    assert second.state_dict()["simulator"] is None
+    second.step()
+    with pytest.warns(UserWarning, match="the environment cannot be restored"):
+        first.load_state_dict(second.state_dict())
+    assert first.state_dict()["frames"] == 2
+    first.step()
+    assert first.frames == 4
+    first.shutdown()
+    second.shutdown()
+
+
+def _make_rescaled() -> TransformedEnv:
+    return TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
 
 
 def test_shutdown_closes_the_environment_and_may_be_repeated():
