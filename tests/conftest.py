@@ -1,4 +1,4 @@
-"""What goes wrong outside of Python: processes that are killed, disks that are full."""
+"""What goes wrong outside of Python: processes that are killed, disks that are full, extensions that do not load."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 
@@ -116,3 +118,34 @@ def _die_at(moment: int) -> None:
         return write_bytes(path, data)
 
     os.fsync, Path.write_bytes = counted_fsync, in_halves
+
+
+class _Tree:
+    """A segment tree without the tree: the same answers, slowly."""
+
+    def __init__(self, neutral: float, reduce: np.ufunc, capacity: int) -> None:
+        self.values, self.reduce = np.full(capacity, neutral, dtype=np.float32), reduce
+
+    def __getitem__(self, index):
+        return self.values[np.asarray(index)]
+
+    def __setitem__(self, index, value):
+        self.values[np.asarray(index)] = np.asarray(value)
+
+    def query(self, begin: int, end: int) -> float:
+        return float(self.reduce.reduce(self.values[begin:end]))
+
+    def scan_lower_bound(self, mass):
+        return np.searchsorted(self.values.cumsum(dtype=np.float64), np.asarray(mass))
+
+
+@pytest.fixture
+def segment_trees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What TorchRL's prioritised samplers need of its C++ extension: stand-ins where that does not load."""
+    import torchrl.data.replay_buffers.samplers.prioritized as prioritized
+
+    if prioritized.SumSegmentTreeFp32 is not None:
+        return
+    for kind, neutral, reduce in (("Sum", 0.0, np.add), ("Min", np.inf, np.minimum)):
+        for dtype in ("Fp32", "Fp64"):
+            monkeypatch.setattr(prioritized, f"{kind}SegmentTree{dtype}", partial(_Tree, neutral, reduce))

@@ -35,7 +35,7 @@ _FLOORS = (
         "analysis": {"envs", "runs"},  # of the environments the names of the tasks
     },
     {
-        "planners": {"functional", "keys", "modules"},
+        "planners": {"functional", "keys", "envs", "modules"},  # of the environments what fits a model
         "objectives": {"functional", "keys", "modules"},
         "testing": {"functional", "keys", "modules"},
     },

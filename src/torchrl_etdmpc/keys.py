@@ -24,6 +24,10 @@ LATENT = "latent"
 """``[L]``: the observation of the imagined environment."""
 TRAJECTORY = ("collector", "traj_ids")
 """``[...]`` int64: which episode a row belongs to, as TorchRL's collectors number them."""
+ENV_INDEX = "env_index"
+"""``[...]`` int64: which environment a row is of, as TorchRL's ``AsyncBatchedCollector`` writes it."""
+MASK = ("collector", "mask")
+"""``[...]`` bool: false where a row is padding, as TorchRL's collectors write it with ``split_trajs=True``."""
 
 PLAN = "plan"
 """Root of the planner's target, whose fields are :data:`PLAN_FIELDS`."""

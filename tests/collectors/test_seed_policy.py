@@ -4,19 +4,19 @@ import pytest
 import torch
 from scipy.stats import kstest
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, OneHot, Unbounded
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, SeedPolicy, WorldModel
 
-BOUNDS = Bounded(low=torch.tensor([-1.0, 0.0]), high=torch.tensor([1.0, 5.0]), shape=(2,))
+BOUNDS = Bounded(-1, 1, shape=(2,))
 
 
-def test_actions_are_uniform_within_the_bounds_of_each_dimension():
+def test_actions_are_uniform_in_the_planner_s_bounds():
     torch.manual_seed(0)
     spec = BOUNDS.expand(4000, 2)
     actions = SeedPolicy(spec)(TensorDict(batch_size=[4000]))["action"].double()
-    for dimension, (low, high) in enumerate([(-1, 1), (0, 5)]):
-        assert kstest(actions[:, dimension], "uniform", args=(low, high - low)).pvalue > 1e-3
+    for dimension in range(2):
+        assert kstest(actions[:, dimension], "uniform", args=(-1, 2)).pvalue > 1e-3
 
 
 def test_successive_actions_differ_and_follow_torch_manual_seed():
@@ -77,7 +77,18 @@ def test_its_targets_do_not_share_memory():
     assert (SeedPolicy(BOUNDS)(TensorDict())["plan", "loc"] == 0).all()
 
 
-@pytest.mark.parametrize("spec", [Unbounded((2,)), Categorical(4)])
-def test_an_action_without_bounds_is_refused(spec):
-    with pytest.raises(ValueError, match=f"needs a bounded continuous action, got {type(spec).__name__}"):
+@pytest.mark.parametrize(
+    ("spec", "fault"),
+    [
+        (Unbounded((2,)), "action has no finite bounds"),
+        (Bounded(low=torch.zeros(2), high=torch.tensor([1.0, torch.inf])), "action has no finite bounds"),
+        (Bounded(0, 10, shape=(2,)), r"action has bounds of 0 and 10 instead of -1 and 1 \(append ActionScaling"),
+        (Bounded(-2, 2, shape=(2,)), "action has bounds of -2 and 2"),
+        (Bounded(torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 0.5])), "action has bounds of -1 and 0.5"),
+        (Categorical(4), r"action is discrete \(Categorical\)"),
+        (OneHot(4), r"action is discrete \(OneHot\)"),
+    ],
+)
+def test_an_action_that_the_planner_would_not_take_is_refused(spec, fault):
+    with pytest.raises(ValueError, match=rf"SeedPolicy acts in \[-1, 1\], as the planner does, but {fault}"):
         SeedPolicy(spec)

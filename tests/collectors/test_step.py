@@ -18,6 +18,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import (
+    ActionScaling,
     Compose,
     EnvBase,
     ExplorationType,
@@ -28,7 +29,7 @@ from torchrl.envs import (
     TensorDictPrimer,
     TransformedEnv,
 )
-from torchrl.envs.utils import exploration_type
+from torchrl.envs.utils import RandomPolicy, exploration_type
 from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
 
 from torchrl_etdmpc import (
@@ -306,7 +307,7 @@ def test_what_is_stored_equals_an_independent_replay_of_the_actions(lengths):
 def test_a_gymnasium_task_is_stored_as_gymnasium_itself_plays_it():
     gymnasium = pytest.importorskip("gymnasium")
     env, replay = GymEnv("Pendulum-v1"), make_replay()
-    collector = StepCollector(env, SeedPolicy(env.action_spec), replay_buffer=replay, total_frames=230)
+    collector = StepCollector(env, RandomPolicy(env.action_spec), replay_buffer=replay, total_frames=230)
     collector.set_seed(5)
     for _ in collector:
         pass
@@ -607,6 +608,30 @@ def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
     assert min(fresh[TRAJ_KEY].tolist()) > max(used)
     for row in (steps[0] for steps in episodes(fresh).values()):
         assert row["observation"][1] == 0
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
+def test_a_collector_that_has_not_acted_can_be_saved_even_if_its_workers_rescale_actions(kind):
+    def make_collector() -> StepCollector:
+        env = kind(2, _make_rescaled)
+        return StepCollector(env, RandomPolicy(env.action_spec), replay_buffer=make_replay())
+
+    first, second = make_collector(), make_collector()
+    second.load_state_dict(first.state_dict())
+    second.act()
+    assert second.state_dict()["simulator"] is None
+    second.step()
+    with pytest.warns(UserWarning, match="the environment cannot be restored"):
+        first.load_state_dict(second.state_dict())
+    assert first.state_dict()["frames"] == 2
+    first.step()
+    assert first.frames == 4
+    first.shutdown()
+    second.shutdown()
+
+
+def _make_rescaled() -> TransformedEnv:
+    return TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
 
 
 def test_shutdown_closes_the_environment_and_may_be_repeated():

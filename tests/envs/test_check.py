@@ -9,7 +9,8 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, Unboun
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_etdmpc.envs import check_env
+from torchrl_etdmpc import WorldModel
+from torchrl_etdmpc.envs import check_env, check_spaces
 
 _VECTOR = Unbounded(3)
 _ACTION = Bounded(-1, 1, shape=(2,), dtype=torch.float32)
@@ -192,3 +193,84 @@ def test_flags_and_sums_of_the_wrong_kind_are_named():
 def test_further_entries_and_transforms_are_nobodys_business():
     check_env(complete(SpecEnv(observations={"observation": _VECTOR, "pixels": Unbounded((3, 8, 8))})))
     check_env(complete(SpecEnv()).append_transform(StepCounter(4)))
+
+
+def _model(observation_dim=3, action_dim=2, **options) -> WorldModel:
+    return WorldModel(observation_dim, action_dim, latent_dim=16, mlp_dim=16, encoder_dim=16, **options)
+
+
+# What does not fit a model of three observations and two actions, and what mends it where a transform can.
+_MISFITS = {
+    "one action too many": (
+        {"action": Bounded(-1, 1, shape=(3,), dtype=torch.float32)},
+        "action has 3 entries instead of the model's 2 (build the model with action_dim=3)",
+    ),
+    "another observation": (
+        {"observations": {"observation": Unbounded(5)}},
+        "observation has 5 entries instead of the model's 3 (build the model with observation_dim=5, or append "
+        "CatTensors if the environment writes more than one vector)",
+    ),
+    "one-hot actions": ({"action": OneHot(2)}, "action is discrete (OneHot); only continuous actions are supported"),
+    "no bounds": ({"action": Unbounded(2)}, "action has no finite bounds"),
+    "half-open bounds": (
+        {"action": Bounded(low=torch.full((2,), -1.0), high=torch.tensor([1, torch.inf]))},
+        "action has no finite bounds",
+    ),
+    "bounds of 0 and 10": (
+        {"action": Bounded(0, 10, shape=(2,), dtype=torch.float32)},
+        "action has bounds of 0 and 10 instead of -1 and 1 (append ActionScaling())",
+    ),
+    "float64": (
+        {"observations": {"observation": Unbounded(3, dtype=torch.float64)}},
+        "observation is float64 instead of float32 (append DoubleToFloat(in_keys=['observation']))",
+    ),
+}
+
+
+@pytest.mark.parametrize("batched", [False, True], ids=["one", "two"])
+@pytest.mark.parametrize("misfit", _MISFITS)
+def test_an_environment_is_compared_with_the_model(misfit, batched):
+    options, expected = _MISFITS[misfit]
+    env = SerialEnv(2, lambda: SpecEnv(**options)) if batched else SpecEnv(**options)
+    assert expected in faults_of(lambda: check_spaces(env, observation_dim=3, action_dim=2))
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        check_env(complete(env), _model())
+
+
+def faults_of(check) -> str:
+    with pytest.raises(ValueError) as error:
+        check()
+    text = str(error.value)
+    assert "\n" not in text and text.startswith("this environment does not fit the model: ")
+    return text
+
+
+def test_an_environment_that_fits_the_model_passes():
+    check_env(complete(SpecEnv()), _model())
+    check_spaces(SpecEnv(), observation_dim=3, action_dim=2)
+
+
+def test_the_dtype_is_that_of_the_model_s_weights():
+    expected = (
+        "observation is float32 instead of float64 (append DTypeCastTransform(torch.float32, torch.float64, "
+        "in_keys=['observation']))"
+    )
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        check_env(complete(SpecEnv()), _model().double())
+
+
+def test_a_model_that_encodes_what_it_likes_is_not_asked_about_observations():
+    pixels = SpecEnv(observations={"pixels": Unbounded((3, 8, 8), dtype=torch.uint8)})
+    check_spaces(pixels, observation_dim=None, action_dim=2)
+    model = _model()
+    model.observation_dim = None  # pyright: ignore[reportAttributeAccessIssue]
+    check_env(complete(pixels), model)
+
+
+def test_spaces_are_found_under_other_keys():
+    env = SpecEnv(observations={"state": Composite(x=_VECTOR)}, action_key="torque")
+    keys = {"observation_key": ("state", "x"), "action_key": "torque"}
+    check_spaces(env, observation_dim=3, action_dim=2, **keys)
+    text = faults_of(lambda: check_spaces(env, observation_dim=4, action_dim=1, **keys))
+    assert "('state', 'x') has 3 entries instead of the model's 4" in text
+    assert "torque has 2 entries instead of the model's 1" in text

@@ -10,6 +10,7 @@ from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     RandomSampler,
+    SliceSampler,
     TensorDictReplayBuffer,
     TensorDictRoundRobinWriter,
 )
@@ -488,6 +489,26 @@ def test_a_sample_without_targets_or_index_is_refused(missing):
     with pytest.raises(KeyError, match=r"needs 'index' and \('plan', 'loc'\), .* in the sample"):
         reanalyze.refresh(sample)
     assert len(reanalyze.planner.calls) == 1  # that of buffer.sample()
+
+
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        StepSliceSampler(SLICE_LEN),
+        SliceSampler(slice_len=SLICE_LEN, traj_key=("collector", "traj_ids")),
+        SliceSampler(num_slices=4, traj_key=("collector", "traj_ids")),
+    ],
+    ids=["ours", "slice_len", "num_slices"],
+)
+def test_slices_of_another_length_than_the_sampler_s_are_refused(sampler):
+    buffer = make_buffer(40, sampler=sampler)
+    with pytest.raises(ValueError, match=rf"slice_len=4 of reanalyze is not .*, 3, .* pass slice_len={SLICE_LEN}\."):
+        make_reanalyze(buffer, slice_len=4)
+    make_reanalyze(buffer, slice_len=SLICE_LEN)
+
+
+def test_a_sampler_that_knows_no_slices_is_taken():
+    make_reanalyze(make_buffer(40, sampler=RandomSampler()))
 
 
 @pytest.mark.parametrize("name", ["slice_len", "interval", "num_slices"])

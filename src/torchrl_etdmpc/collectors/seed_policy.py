@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Composite, TensorSpec
 
+from torchrl_etdmpc.envs.check import action_faults
 from torchrl_etdmpc.keys import ACTION, FALLBACK, LOC, PLAN, PLAN_FIELDS, SCALE, VALUE, VERSION
 
 
@@ -16,17 +17,19 @@ class SeedPolicy(TensorDictModuleBase):
     Writing the whole schema from the first row on matters: a storage leaves missing entries uninitialised.
 
     Args:
-        action_spec (TensorSpec): bounds of the action, of the whole batch of environments; a ``Composite`` (an
-            environment's ``action_spec`` if its action is nested) is read at ``action_key``.
+        action_spec (TensorSpec): spec of the action, of the whole batch of environments, bounded by exactly -1 and 1 as
+            the planner's actions are; a ``Composite`` (an environment's ``action_spec`` if its action is nested) is
+            read at ``action_key``.
 
     Keyword Args:
         action_key (NestedKey): Default: ``"action"``.
         plan_key (NestedKey): root of the target. Default: ``"plan"``.
 
     Raises:
-        ValueError: if the action is not bounded.
+        ValueError: if the action is not continuous and bounded by exactly -1 and 1.
 
     >>> from tensordict import TensorDict
+    >>> from torchrl.data import Bounded
     >>> policy = SeedPolicy(Bounded(-1, 1, shape=(2,)))
     >>> policy(TensorDict())["plan", "scale"].tolist()
     [1.0, 1.0]
@@ -36,8 +39,9 @@ class SeedPolicy(TensorDictModuleBase):
         super().__init__()
         if isinstance(action_spec, Composite):
             action_spec = action_spec[action_key]
-        if not isinstance(action_spec, Bounded):
-            raise ValueError(f"SeedPolicy needs a bounded continuous action, got {type(action_spec).__name__}.")
+        faults = [*action_faults(action_spec, action_spec.dtype, action_key)]
+        if faults:
+            raise ValueError(f"SeedPolicy acts in [-1, 1], as the planner does, but {'; '.join(faults)}.")
         self.action_spec = action_spec
         self.action_key = unravel_key(action_key)
         self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}

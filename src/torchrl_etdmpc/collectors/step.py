@@ -59,7 +59,8 @@ class StepCollector(BaseCollector):
         policy_device (torch.device, optional): where the policy's inputs go. Default: the environment's device.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or the environment does not fit a planner's model
+            (:func:`~torchrl_etdmpc.envs.check_spaces`).
         NonFiniteError: while iterating, if an observation, a reward or an action is not finite. The step is not
             stored, the running episodes end at their last step, as truncated ones, and collection can go on with
             fresh ones.
@@ -121,6 +122,7 @@ class StepCollector(BaseCollector):
         self._next_trajectory = 0
         self._carrier: TensorDictBase | None = None
         self._after_reset = False
+        self._begun = False  # whether the environment is at a place worth coming back to
         self._last_rows: int | torch.Tensor | None = None
         self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
         self._schema: dict[bool, set] = {}
@@ -180,6 +182,7 @@ class StepCollector(BaseCollector):
             acted (TensorDictBase): what :meth:`act` returned.
         """
         stepped, carrier = self._ask(self.env.step_and_maybe_reset, acted)
+        self._begun = True
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
         self._check_schema(kept, self.in_seed_phase)
@@ -291,10 +294,12 @@ class StepCollector(BaseCollector):
 
         Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)`` reads them.
         """
+        # Before its first step an environment cannot always be asked: TorchRL's ActionScaling makes its buffers then,
+        # and a worker process that fails to read them is lost.
         return OrderedDict(
             frames=self._frames,
             next_trajectory=self._next_trajectory,
-            simulator=simulator_state(self.env),
+            simulator=simulator_state(self.env) if self._begun else None,
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
         )
@@ -319,6 +324,7 @@ class StepCollector(BaseCollector):
                 stacklevel=2,
             )
             return
+        self._begun = True
         if state_dict["carrier"] is None:  # between episodes
             return
         batch_size, device = self.env.batch_size, self.env.device
@@ -340,11 +346,19 @@ def _truncate(rows: TensorDictBase) -> None:
 
 
 def _with_primer(env: EnvBase, policy: nn.Module) -> EnvBase:
-    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already."""
+    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already.
+
+    A primer that knows what its policy's model takes compares it with the environment first.
+    """
     make_primer = getattr(policy, "make_tensordict_primer", None)
-    if make_primer is None or not getattr(policy, "warm_start", True):
+    if make_primer is None:
         return env
     primer = make_primer()
+    check = getattr(primer, "check", None)
+    if check is not None:
+        check(env)
+    if not getattr(policy, "warm_start", True):
+        return env
     present = set(env.full_observation_spec.keys(True, True)) | set(env.full_state_spec.keys(True, True))
     if all(unravel_key(key) in present for key in primer.primers.keys(True, True)):
         return env

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
+from tensordict import NestedKey, unravel_key
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-__all__ = ["check_env"]
+__all__ = ["check_env", "check_spaces"]
 
 
-def check_env(env: EnvBase) -> None:
+def check_env(env: EnvBase, model: Any = None) -> None:
     """Checks that an environment has the entries that planners, collectors and losses expect.
 
     ======================================= ==============================================================
@@ -30,6 +32,9 @@ def check_env(env: EnvBase) -> None:
 
     Args:
         env (EnvBase): any TorchRL environment, batched or not, with any transforms around it.
+        model (nn.Module, optional): a world model that the environment is for: O and A must be its ``observation_dim``
+            and ``action_dim``, and their dtype that of its weights. Where ``observation_dim`` is not a number, the
+            model encodes what it likes and the observation is not checked. Default: any size, float32.
 
     Raises:
         ValueError: if anything is missing or wrong; names all of it, each with the transform that mends it.
@@ -41,60 +46,147 @@ def check_env(env: EnvBase) -> None:
     ValueError: this environment cannot be used as it is: action has bounds of -2 and 2 instead of -1 and 1 (append
     ActionScaling()); is_init is missing (append InitTracker()); episode_reward is missing (append RewardSum()).
     """
-    checks = (_observation, _action, _reward, _flags, _written_by_transforms)
-    wrong = [fault for check in checks for fault in check(env)]
-    if wrong:
-        raise ValueError(f"this environment cannot be used as it is: {'; '.join(wrong)}.")
+    sizes = model_sizes(model) if model is not None else {}
+    faults = [*_spaces(env, **sizes), *_reward(env), *_flags(env), *_written_by_transforms(env)]
+    if faults:
+        raise ValueError(f"this environment cannot be used as it is: {'; '.join(faults)}.")
 
 
-def _observation(env: EnvBase) -> Iterator[str]:
+def check_spaces(
+    env: EnvBase,
+    *,
+    observation_dim: int | None,
+    action_dim: int,
+    dtype: torch.dtype = torch.float32,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
+) -> None:
+    """The part of :func:`check_env` that is between an environment and what acts in it.
+
+    Args:
+        env (EnvBase): as for :func:`check_env`.
+
+    Keyword Args:
+        observation_dim (int, optional): O that the model takes; ``None`` if it encodes what it likes, which is not
+            checked.
+        action_dim (int): A that the model takes.
+        dtype (torch.dtype): of both. Default: float32.
+        observation_key (NestedKey): Default: ``"observation"``.
+        action_key (NestedKey): Default: ``"action"``.
+
+    Raises:
+        ValueError: if the action is not continuous, not bounded by exactly -1 and 1 or of another size or dtype, or the
+            observation is no vector of the size and dtype; each with what mends it.
+
+    >>> from torchrl.envs import GymEnv
+    >>> check_spaces(GymEnv("Pendulum-v1"), observation_dim=3, action_dim=1)
+    Traceback (most recent call last):
+        ...
+    ValueError: this environment does not fit the model: action has bounds of -2 and 2 instead of -1 and 1 (append
+    ActionScaling()).
+    """
+    keys = {"observation_key": observation_key, "action_key": action_key}
+    faults = [*_spaces(env, observation_dim=observation_dim, action_dim=action_dim, dtype=dtype, **keys)]
+    if faults:
+        raise ValueError(f"this environment does not fit the model: {'; '.join(faults)}.")
+
+
+def model_sizes(model: Any) -> dict[str, Any]:
+    """The arguments of :func:`check_spaces` that a world model decides."""
+    size = getattr(model, "observation_dim", None)
+    dtypes = (tensor.dtype for tensor in (*model.parameters(), *model.buffers()) if tensor.is_floating_point())
+    return {
+        "observation_dim": size if isinstance(size, int) else None,
+        "action_dim": model.action_dim,
+        "dtype": next(dtypes, torch.get_default_dtype()),
+    }
+
+
+_ANY_SIZE = -1
+
+
+def _spaces(
+    env: EnvBase,
+    *,
+    observation_dim: int | None = _ANY_SIZE,
+    action_dim: int = _ANY_SIZE,
+    dtype: torch.dtype = torch.float32,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
+) -> Iterator[str]:
+    if observation_dim is not None:
+        yield from _observation(env, unravel_key(observation_key), observation_dim, dtype)
+    yield from _action(env, unravel_key(action_key), action_dim, dtype)
+
+
+def _observation(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) -> Iterator[str]:
     specs = env.full_observation_spec
-    spec = specs.get("observation", None)
+    spec = specs.get(key, None)
+    name = _text(key)
     if spec is None:
         entries = [(key, leaf) for key, leaf in specs.items(True, True) if key != "episode_reward"]
         vectors = [key for key, leaf in entries if leaf.dtype.is_floating_point and len(_shape(env, leaf)) < 2]
         if vectors:
-            yield f"observation is missing (append CatTensors(in_keys={vectors}, out_key='observation'))"
+            yield f"{name} is missing (append CatTensors(in_keys={vectors}, out_key={key!r}))"
         elif any(_is_pixels(env, leaf) for _, leaf in entries):
-            yield "observation is missing, and pixel observations are not supported"
+            yield f"{name} is missing, and pixel observations are not supported"
         else:
-            yield "observation is missing"
+            yield f"{name} is missing"
     elif isinstance(spec, Composite):
-        yield "observation is a dictionary, which is not supported"
+        yield f"{name} is a dictionary, which is not supported"
     elif _is_pixels(env, spec):
-        yield f"observation holds pixels {list(_shape(env, spec))}, which are not supported"
+        yield f"{name} holds pixels {list(_shape(env, spec))}, which are not supported"
     elif not isinstance(spec, (Bounded, Unbounded)):
-        yield f"observation is discrete ({type(spec).__name__}), which is not supported"
+        yield f"{name} is discrete ({type(spec).__name__}), which is not supported"
     else:
-        yield from _float32("observation", spec, "in_keys")
-        dims = len(_shape(env, spec))
-        if dims == 0:
-            yield "observation is a single number (append UnsqueezeTransform(-1, in_keys=['observation']))"
-        elif dims > 1:
-            flatten = f"FlattenObservation({-dims}, -1, in_keys=['observation'])"
-            yield f"observation has {dims} dimensions instead of 1 (append {flatten})"
+        yield from _dtype(key, spec, dtype, "in_keys")
+        shape = _shape(env, spec)
+        if len(shape) == 0:
+            yield f"{name} is a single number (append UnsqueezeTransform(-1, in_keys=[{key!r}]))"
+        elif len(shape) > 1:
+            flatten = f"FlattenObservation({-len(shape)}, -1, in_keys=[{key!r}])"
+            yield f"{name} has {len(shape)} dimensions instead of 1 (append {flatten})"
+        elif size not in (_ANY_SIZE, shape[0]):
+            yield (
+                f"{name} has {shape[0]} entries instead of the model's {size} (build the model with "
+                f"observation_dim={shape[0]}, or append CatTensors if the environment writes more than one vector)"
+            )
 
 
-def _action(env: EnvBase) -> Iterator[str]:
+def _action(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) -> Iterator[str]:
     keys = list(env.action_keys)
-    if keys != ["action"]:
-        rename = f"RenameTransform(in_keys=[], out_keys=[], in_keys_inv={keys}, out_keys_inv=['action'])"
+    if keys != [key]:
+        rename = f"RenameTransform(in_keys=[], out_keys=[], in_keys_inv={keys}, out_keys_inv=[{key!r}])"
         remedy = f" (append {rename})" if len(keys) == 1 else ""
-        yield f"the actions are {keys} instead of one 'action'{remedy}"
+        yield f"the actions are {keys} instead of one {key!r}{remedy}"
         return
-    spec = env.action_spec
+    spec = env.full_action_spec[key]
+    yield from action_faults(spec, dtype, key)
+    shape = _shape(env, spec)
     if spec.domain != "continuous":
-        yield f"action is discrete ({type(spec).__name__}); only continuous actions are supported"
+        return
+    if len(shape) != 1:
+        yield f"{_text(key)} has the shape {list(shape)} instead of [A]"
+    elif size not in (_ANY_SIZE, shape[0]):
+        yield (
+            f"{_text(key)} has {shape[0]} entries instead of the model's {size} (build the model with "
+            f"action_dim={shape[0]})"
+        )
+
+
+def action_faults(spec: TensorSpec, dtype: torch.dtype = torch.float32, key: NestedKey = "action") -> Iterator[str]:
+    """What keeps an action's spec, whatever its size, from being continuous in [-1, 1]."""
+    name = _text(key)
+    if spec.domain != "continuous":
+        yield f"{name} is discrete ({type(spec).__name__}); only continuous actions are supported"
         return
     if not isinstance(spec, Bounded) or not (spec.space.low.isfinite().all() and spec.space.high.isfinite().all()):
-        yield "action has no finite bounds, so it cannot be rescaled (give the environment's action_spec some)"
+        yield f"{name} has no finite bounds, so it cannot be rescaled (give the environment's action_spec some)"
     else:
         bounds = torch.stack([spec.space.low.flatten(), spec.space.high.flatten()], -1)
         for low, high in bounds[(bounds != bounds.new_tensor([-1, 1])).any(-1)].tolist()[:1]:
-            yield f"action has bounds of {low:g} and {high:g} instead of -1 and 1 (append ActionScaling())"
-    yield from _float32("action", spec, "in_keys_inv")
-    if len(_shape(env, spec)) != 1:
-        yield f"action has the shape {list(_shape(env, spec))} instead of [A]"
+            yield f"{name} has bounds of {low:g} and {high:g} instead of -1 and 1 (append ActionScaling())"
+    yield from _dtype(key, spec, dtype, "in_keys_inv")
 
 
 def _reward(env: EnvBase) -> Iterator[str]:
@@ -103,7 +195,7 @@ def _reward(env: EnvBase) -> Iterator[str]:
         remedy = f" (append RenameTransform(in_keys={keys}, out_keys=['reward']))" if len(keys) == 1 else ""
         yield f"the rewards are {keys} instead of one 'reward'{remedy}"
         return
-    yield from _float32("reward", env.reward_spec, "in_keys")
+    yield from _dtype("reward", env.reward_spec, torch.float32, "in_keys")
     yield from _one_number(env, "reward", env.reward_spec)
 
 
@@ -126,19 +218,19 @@ def _written_by_transforms(env: EnvBase) -> Iterator[str]:
         if spec is None:
             yield f"{key} is missing (append {transform}())"
         elif spec.dtype != dtype:
-            yield f"{key} is {_name(spec)} instead of {str(dtype).removeprefix('torch.')}"
+            yield f"{key} is {_name(spec.dtype)} instead of {_name(dtype)}"
         else:
             yield from _one_number(env, key, spec)
 
 
-def _float32(key: str, spec: TensorSpec, argument: str) -> Iterator[str]:
-    if spec.dtype == torch.float32:
+def _dtype(key: NestedKey, spec: TensorSpec, dtype: torch.dtype, argument: str) -> Iterator[str]:
+    if spec.dtype == dtype:
         return
-    if spec.dtype == torch.float64:
-        remedy = f"DoubleToFloat({argument}=['{key}'])"
+    if (spec.dtype, dtype) == (torch.float64, torch.float32):
+        remedy = f"DoubleToFloat({argument}=[{key!r}])"
     else:
-        remedy = f"DTypeCastTransform({spec.dtype}, torch.float32, {argument}=['{key}'])"
-    yield f"{key} is {_name(spec)} instead of float32 (append {remedy})"
+        remedy = f"DTypeCastTransform({spec.dtype}, {dtype}, {argument}=[{key!r}])"
+    yield f"{_text(key)} is {_name(spec.dtype)} instead of {_name(dtype)} (append {remedy})"
 
 
 def _one_number(env: EnvBase, key: str, spec: TensorSpec) -> Iterator[str]:
@@ -155,5 +247,9 @@ def _is_pixels(env: EnvBase, spec: TensorSpec) -> bool:
     return len(_shape(env, spec)) == 3 or (spec.dtype == torch.uint8 and len(_shape(env, spec)) > 1)
 
 
-def _name(spec: TensorSpec) -> str:
-    return str(spec.dtype).removeprefix("torch.")
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _text(key: NestedKey) -> str:
+    return key if isinstance(key, str) else repr(key)

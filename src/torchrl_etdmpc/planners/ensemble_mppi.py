@@ -11,10 +11,11 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.data import Unbounded
-from torchrl.envs import ExplorationType, TensorDictPrimer
+from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 from torchrl.modules import MPCPlannerBase
 
+from torchrl_etdmpc.envs.check import model_sizes
 from torchrl_etdmpc.functional import (
     Elites,
     Gaussian,
@@ -45,6 +46,7 @@ from torchrl_etdmpc.modules.prediction import PredictionModel
 from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
+from torchrl_etdmpc.planners.primer import PlanPrimer
 from torchrl_etdmpc.planners.scores import Score, ScoreFunction, ScoreName, make_score
 
 FirstAction = Literal["elite", "mean", "best"]
@@ -203,13 +205,16 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         # What was compiled is bound to this object: in a copy it would go on planning with the original's weights.
         return super().__getstate__() | {"compiled_plan": None}
 
-    def make_tensordict_primer(self) -> TensorDictPrimer:
+    def make_tensordict_primer(self) -> PlanPrimer:
         """Transform that adds the warm start to an environment's reset and zeroes it there.
 
-        Collectors find it by themselves (``auto_register_policy_transforms=True``).
+        Collectors find it by themselves (``auto_register_policy_transforms=True``). At the first reset it raises a
+        ``ValueError`` where environment and model do not fit (:func:`~torchrl_etdmpc.envs.check_spaces`).
         """
         spec = Unbounded(torch.Size([self.horizon, self.world_model.action_dim]))
-        return TensorDictPrimer({self.plan_mean_key: spec}, default_value=0.0, expand_specs=True)
+        keys = {"observation_key": self.observation_key, "action_key": self.out_keys[0]}
+        fits = {"spaces": model_sizes(self.world_model) | keys, "latent_key": self.latent_key}
+        return PlanPrimer({self.plan_mean_key: spec}, default_value=0.0, expand_specs=True, **fits)
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """Plans and returns the action alone (the interface of TorchRL's planners)."""

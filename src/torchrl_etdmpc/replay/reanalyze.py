@@ -111,7 +111,8 @@ class ReanalyzeTransform(Transform):
             ReanalyzeTransform: itself.
 
         Raises:
-            ValueError: if the buffer's writer does not track generations, or the buffer prefetches.
+            ValueError: if the buffer's writer does not track generations, the buffer prefetches, or its sampler makes
+                slices of another length.
         """
         if not getattr(replay_buffer.writer, "tracks_generations", False):
             raise ValueError(
@@ -122,6 +123,12 @@ class ReanalyzeTransform(Transform):
             raise ValueError(
                 "reanalyze runs the planner inside sample(), which a prefetching buffer would do in a thread beside "
                 "the optimiser; build the buffer without prefetch."
+            )
+        sampled = _sampled_slice_len(replay_buffer)
+        if sampled not in (None, self.slice_len):
+            raise ValueError(
+                f"slice_len={self.slice_len} of reanalyze is not that of the buffer's sampler, {sampled}, so it would "
+                f"re-plan parts of slices; pass slice_len={sampled}."
             )
         self.__dict__["replay_buffer"] = replay_buffer
         replay_buffer.append_transform(self)
@@ -188,3 +195,12 @@ class ReanalyzeTransform(Transform):
             tensordict.set(key, stored)
         # Rows beyond the first slices may be copies of re-planned ones; they keep their old target in this batch.
         return tensordict
+
+
+def _sampled_slice_len(replay_buffer: TensorDictReplayBuffer) -> int | None:
+    """Rows per slice that the buffer's sampler makes, as far as it says so."""
+    slice_len = getattr(replay_buffer.sampler, "slice_len", None)
+    num_slices = getattr(replay_buffer.sampler, "num_slices", None)  # TorchRL's slice samplers have one of the two
+    if slice_len is None and num_slices and replay_buffer.batch_size:
+        slice_len = replay_buffer.batch_size // num_slices
+    return slice_len

@@ -7,65 +7,62 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage, TensorStorage
 
-from torchrl_etdmpc.keys import TRAJECTORY
+from torchrl_etdmpc.keys import DONE, ENV_INDEX, IS_INIT, MASK, NEXT, TRAJECTORY
+from torchrl_etdmpc.replay.trajectories import Trajectories
 
 UniformOver = Literal["episodes", "starts"]
 
 
-class _Segments:
-    """Runs of rows of one trajectory, as arithmetic progressions of write counts (amortised O(1) to append)."""
-
-    fields = ("start", "stride", "length", "trajectory")
-
-    def __init__(self) -> None:
-        self.table = np.zeros((len(self.fields), 64), dtype=np.int64)
-        self.size = 0
-
-    def append(self, start: int, trajectory: int) -> int:
-        if self.size == self.table.shape[1]:
-            self.table = np.concatenate([self.table, np.zeros_like(self.table)], axis=1)
-        self.table[:, self.size] = (start, 1, 1, trajectory)
-        self.size += 1
-        return self.size - 1
-
-    def view(self) -> np.ndarray:
-        return self.table[:, : self.size]
-
-    def keep(self, mask: np.ndarray) -> None:
-        self.table = np.pad(self.view()[:, mask], ((0, 0), (0, 64)))
-        self.size = int(mask.sum())
-
-
 class StepSliceSampler(Sampler):
-    """Samples slices of consecutive transitions of one trajectory, usable while an episode is still being written.
+    """Samples slices of consecutive transitions of one episode, usable while the episode is still being written.
 
-    Every sample holds exactly ``batch_size / slice_len`` slices. A slice never crosses the border of a trajectory nor
-    the write head of a full ring buffer, and a trajectory can be sampled from its first complete slice on. Rows of
-    several environments may be interleaved, as :class:`~torchrl_etdmpc.collectors.StepCollector` writes them.
+    Every sample holds exactly ``batch_size / slice_len`` slices. A slice never crosses the border of an episode nor
+    the write head of a full ring buffer, and an episode can be sampled from its first complete slice on. The rows of
+    several environments may come in any order, as long as those of one environment come in the order of its steps:
+    interleaved, as :class:`~torchrl_etdmpc.collectors.StepCollector` writes them, or as batches ``[N, T]`` of TorchRL's
+    collectors, flattened with ``batch.reshape(-1)``. A buffer that was filled before it got this sampler will do.
+
+    **What must be unique**: among the episodes that run at the same time, no two may have the same id. An id may come
+    back after its episode has ended, which is where ``("next", "done")`` is true or where the next row has ``is_init``
+    (``torchrl.envs.InitTracker``). TorchRL's collectors number the episodes of all their workers together, but Ray's
+    and the distributed ones number them per worker: write the worker's number into its rows and name both keys,
+    ``traj_key=["worker", ("collector", "traj_ids")]``. Two collectors one after the other both begin with 0: let the
+    rows have ``is_init``, so that the second one does not go on with the first one's last episode.
 
     The sampler follows the trajectories as they are written instead of searching the storage for borders, so the cost
     of a sample depends on the number of trajectories in the buffer (two thousand for a million DMC steps) and not on
-    the number of rows. A trajectory is cut where the spacing of its rows changes, so flatten the batches ``[N, T]``
-    that TorchRL's collectors make of N environments time first: ``batch.transpose(0, 1).reshape(-1)``.
+    the number of rows.
+
+    It draws uniformly and takes no priorities; for those use TorchRL's ``PrioritizedSliceSampler`` in its place.
 
     Args:
         slice_len (int): T, transitions per slice.
 
     Keyword Args:
-        traj_key (NestedKey): where the storage holds the trajectory's id, written by TorchRL's collectors. Default:
-            ``("collector", "traj_ids")``.
+        traj_key (NestedKey or list of NestedKey): whole numbers that tell apart the episodes that run at the same time;
+            of several keys, together. Default: ``("collector", "traj_ids")``, written by TorchRL's collectors, or
+            ``"env_index"``, written by its ``AsyncBatchedCollector``, where rows have only that.
+        done_key (NestedKey): the episode ends here. Rows may lack it. Default: ``("next", "done")``.
+        init_key (NestedKey): the episode begins here. Rows may lack it. Default: ``"is_init"``.
+        mask_key (NestedKey): rows where it is false are padding, which is never sampled; TorchRL's collectors write it
+            with ``split_trajs=True``. Rows may lack it. Default: ``("collector", "mask")``.
         uniform_over (str): ``"episodes"`` draws a trajectory uniformly and then a start, which favours the
             running episode (what the public lineage does); ``"starts"`` draws uniformly over all starts. Default:
             ``"episodes"``.
+        partial (bool): whether a slice may also begin in the last T - 1 steps of an episode that has ended (so that
+            an ended episode shorter than T is sampled too). Beyond the end such a slice repeats the last step, and a
+            sample has ``mask_key``, false there. Shapes stay as they are. Default: ``False``.
 
     Raises:
-        ValueError: if an argument is out of range, or a batch size is not a multiple of ``slice_len``.
+        ValueError: if an argument is out of range, a batch size is not a multiple of ``slice_len``, or the rows of the
+            buffer are batches.
         TypeError: if the storage is not a flat tensor storage.
+        KeyError: if the rows lack ``traj_key`` or, with ``partial``, ``done_key``.
         RuntimeError: if there is no complete slice yet, or the sampler missed writes.
 
     >>> from tensordict import TensorDict
@@ -81,24 +78,34 @@ class StepSliceSampler(Sampler):
         self,
         slice_len: int,
         *,
-        traj_key: NestedKey = TRAJECTORY,
+        traj_key: NestedKey | list[NestedKey] = TRAJECTORY,
+        done_key: NestedKey = (NEXT, DONE),
+        init_key: NestedKey = IS_INIT,
+        mask_key: NestedKey = MASK,
         uniform_over: UniformOver = "episodes",
+        partial: bool = False,
     ) -> None:
         if slice_len < 1:
             raise ValueError(f"slice_len must be at least 1, got {slice_len}.")
         if uniform_over not in get_args(UniformOver):
             raise ValueError(f"uniform_over must be one of {', '.join(get_args(UniformOver))}, got {uniform_over!r}.")
+        if isinstance(traj_key, list) and not traj_key:
+            raise ValueError("traj_key must name at least one key, got [].")
         self.slice_len = slice_len
-        self.traj_key = unravel_key(traj_key)
+        self.traj_keys = [unravel_key(key) for key in (traj_key if isinstance(traj_key, list) else [traj_key])]
+        self.done_key = unravel_key(done_key)
+        self.init_key = unravel_key(init_key)
+        self.mask_key = unravel_key(mask_key)
         self.uniform_over = uniform_over
+        self.partial = partial
         self._empty()
 
     def _empty(self) -> None:
         self._written = 0  # rows ever written; row r of the storage holds write number r modulo the capacity
         self._newest: int | Tensor | None = None  # row of the last write, once there is one
-        self._followed = 0  # rows whose trajectory is in the table
-        self._segments = _Segments()
-        self._open: dict[int, int] = {}  # trajectory id -> its last segment
+        self._followed = 0  # rows that are in the table
+        self._trajectories = Trajectories()
+        self._starts: tuple[np.ndarray, np.ndarray] | None = None  # of the rows that were followed
 
     def add(self, index: int) -> None:
         """Is called by the replay buffer after one row was written."""
@@ -117,15 +124,10 @@ class StepSliceSampler(Sampler):
                 f"batch_size must be a multiple of slice_len={self.slice_len}, got {batch_size}; "
                 "pass batch_size = slices * slice_len."
             )
-        first, counts = self._starts(storage)
+        first, counts = self._follow(storage)
         total = int(counts.sum())
         if total == 0:
-            rows = len(storage)  # pyright: ignore[reportArgumentType]
-            raise RuntimeError(
-                f"no trajectory in the buffer has {self.slice_len} steps yet ({rows} rows); collect more before "
-                "sampling."
-            )
-        start, stride, _, _ = self._segments.view()
+            raise RuntimeError(self._nothing_to_sample(storage, first))
         draws = torch.rand(2, batch_size // self.slice_len, dtype=torch.float64, generator=self._rng).numpy()
         if self.uniform_over == "episodes":
             eligible = np.flatnonzero(counts)
@@ -136,102 +138,141 @@ class StepSliceSampler(Sampler):
             position = (draws[0] * total).astype(np.int64)
             chosen = np.searchsorted(ends, position, side="right")
             offset = position - (ends[chosen] - counts[chosen])
-        steps = (first[chosen] + offset)[:, None] + np.arange(self.slice_len)
-        rows = (start[chosen, None] + steps * stride[chosen, None]) % storage.max_size
-        return torch.from_numpy(rows.reshape(-1)).to(_device(storage)), {}
+        chosen, steps = chosen[:, None], (first[chosen] + offset)[:, None] + np.arange(self.slice_len)
+        info: dict[str, Any] = {}
+        if self.partial:
+            # The last step again, so that what is masked is as finite and as far from zero as the rest.
+            last = self._trajectories.lengths[chosen] - 1
+            info[self.mask_key] = torch.from_numpy((steps <= last).reshape(-1)).to(_device(storage))
+            steps = np.minimum(steps, last)
+        rows = self._trajectories.rows(chosen, steps) % storage.max_size
+        return torch.from_numpy(rows.reshape(-1)).to(_device(storage)), info
 
     def _sampleable_count(self, storage: Storage, batch_size: int) -> int:
-        return int(self._starts(storage)[1].sum())
+        return int(self._follow(storage)[1].sum())
 
-    def _starts(self, storage: Storage) -> tuple[np.ndarray, np.ndarray]:
-        """First step of each segment that is still stored and complete, and how many slices start from there on."""
-        self._follow(storage)
-        start, stride, length, _ = self._segments.view()
-        overwritten = self._written - storage.max_size
-        first = np.maximum(-((start - overwritten) // stride), 0)  # ceil((overwritten - start) / stride)
-        return first, np.maximum(length - self.slice_len + 1 - first, 0)
+    def _nothing_to_sample(self, storage: Storage, first: np.ndarray) -> str:
+        rows = len(storage)  # pyright: ignore[reportArgumentType]
+        longest = int((self._trajectories.lengths - first).max(initial=0))
+        text = f"no trajectory in the buffer has {self.slice_len} steps yet ({rows} rows, the longest has {longest})"
+        if rows < storage.max_size and not self._trajectories.ended.any():
+            return f"{text}; collect more before sampling."
+        keys = ", ".join(map(repr, self.traj_keys))
+        return (
+            f"{text}; if episodes are that short, choose a smaller slice_len or partial=True, and if they are not, see "
+            f"that {keys} stays the same from one batch of an episode to the next."
+        )
 
-    def _follow(self, storage: Storage) -> None:
-        """Adds the rows written since the last call to the table and forgets segments that were overwritten."""
+    def _follow(self, storage: Storage) -> tuple[np.ndarray, np.ndarray]:
+        """Adds the rows written since the last call to the table.
+
+        Returns the first step of each trajectory that is still stored, and how many slices start from there on.
+        """
         if not isinstance(storage, TensorStorage) or storage.ndim > 1:
             raise TypeError(
                 "StepSliceSampler needs a one-dimensional tensor storage, got "
                 f"{type(storage).__name__}(ndim={storage.ndim}); use LazyTensorStorage(capacity) or "
                 "LazyMemmapStorage(capacity) and write flat rows."
             )
-        capacity = storage.max_size
-        newest = self._newest = self._written - 1 if self._newest is None else int(self._newest)  # waits once per write
-        if len(storage) != min(self._written, capacity) or (newest + 1 - self._written) % capacity:
-            raise RuntimeError(
-                f"the sampler saw {self._written} writes but the storage holds {len(storage)} of {capacity} rows; "
-                "attach the sampler before the first write, and save and load it together with the storage."
-            )
-        oldest = self._written - capacity
-        begin = max(self._followed, oldest)
-        if begin < self._written:
-            for count, trajectory in zip(
-                range(begin, self._written), self._trajectories(storage, begin, capacity), strict=True
-            ):
-                self._append(count, trajectory, oldest)
+        self._check_written(storage)
+        oldest = max(self._written - storage.max_size, 0)
+        if self._starts is None or self._followed < self._written:
+            begin = max(self._followed, oldest)
+            if begin < self._written:
+                self._read(storage, begin)
             self._followed = self._written
-        self._forget(oldest)
+            self._trajectories.forget(oldest, len(storage))
+            first = self._trajectories.first_alive(oldest)
+            counts = self._trajectories.lengths - first
+            beyond = self.slice_len - 1
+            if self.partial:
+                beyond = np.where(self._trajectories.ended, 0, beyond)
+            self._starts = first, np.maximum(counts - beyond, 0)
+        return self._starts
 
-    def _trajectories(self, storage: Storage, begin: int, capacity: int) -> list[int]:
-        column = storage[:].get(self.traj_key, None)
-        if column is None:
-            raise KeyError(
-                f"StepSliceSampler needs the trajectory id {self.traj_key!r} in every row; collect with StepCollector "
-                "or a TorchRL collector (track_traj_ids=True), or pass traj_key=..."
+    def _check_written(self, storage: TensorStorage) -> None:
+        """Compares what was seen with what is stored; a buffer that was filled before is read from its oldest row."""
+        capacity, stored = storage.max_size, len(storage)
+        if self._newest is None:
+            self._newest = self._written - 1
+        newest = self._newest = int(self._newest)  # waits once per write
+        if stored == min(self._written, capacity) and not (newest + 1 - self._written) % capacity:
+            return
+        if self._followed:
+            raise RuntimeError(
+                f"the sampler saw {self._written} writes but the storage holds {stored} of {capacity} rows; write "
+                "through this buffer, in this process and in order, and save and load the sampler together with the "
+                "storage."
             )
-        rows = torch.arange(begin, self._written, device=column.device) % capacity
-        return column[rows].reshape(-1).tolist()
+        if stored < capacity:
+            newest = stored - 1
+        elif newest < 0:
+            newest = storage._last_cursor_index  # as TorchRL's samplers do
+            if newest is None:
+                raise RuntimeError(
+                    f"the buffer was full ({capacity} rows) before the sampler saw it, and which row is the oldest is "
+                    "not known; write one row, or save and load the sampler together with the storage."
+                )
+        self._newest = int(newest)
+        self._written = self._newest + 1 + (capacity if stored == capacity else 0)
 
-    def _append(self, count: int, trajectory: int, oldest: int) -> None:
-        """Adds write number ``count`` to the last segment of its trajectory, or opens a new segment with it."""
-        # A segment is an arithmetic progression of write numbers. Its second row sets the stride (how many environments
-        # write in turn), and a row that does not continue the progression begins a new segment: a stride that changes
-        # in mid-episode costs the few slices across the seam, and no slice can skip a row.
-        # A lone row may set a stride only while it is still stored: then every row after it is stored too and was seen,
-        # so this one is its successor. Once it is overwritten, rows between the two may have come and gone unseen, and
-        # the stride would be wrong. A longer segment needs no such check, because its next write number is known.
-        position = self._open.get(trajectory)
-        if position is not None:
-            start, stride, length, _ = self._segments.table[:, position]
-            if length == 1 and start >= oldest:
-                self._segments.table[1, position] = count - start
-                self._segments.table[2, position] = 2
-                return
-            if count == start + stride * length:
-                self._segments.table[2, position] += 1
-                return
-        self._open[trajectory] = self._segments.append(count, trajectory)
+    def _read(self, storage: TensorStorage, begin: int) -> None:
+        """Adds the rows from write number ``begin`` on to the table."""
+        stored: TensorDictBase = storage[:]
+        if stored.batch_dims > 1:
+            raise ValueError(
+                f"every row of the buffer is a batch {list(stored.batch_size[1:])}, but StepSliceSampler needs one "
+                "transition per row; write flat rows: buffer.extend(batch.reshape(-1))."
+            )
+        keys = self._id_keys(stored)
+        if self.partial and stored.get(self.done_key, None) is None:
+            raise KeyError(
+                f"partial=True needs {self.done_key!r} in every row, to know which episodes have ended; store it, or "
+                "pass done_key=..."
+            )
+        low, number = begin % storage.max_size, self._written - begin
+        around = low + number > storage.max_size
+        index = torch.arange(low, low + number) % storage.max_size if around else slice(low, low + number)
+        values: dict[NestedKey, Any] = {}
+        for key in (*keys, self.init_key, self.done_key, self.mask_key):
+            column = stored.get(key, None)
+            if column is not None:
+                values[key] = column[index].reshape(number, -1)
+        table = torch.cat(list(values.values()), -1).cpu().numpy()  # one wait for the device
+        begin_column = 0
+        for key, column in values.items():
+            values[key] = table[:, begin_column : begin_column + column.shape[1]]
+            begin_column += column.shape[1]
+        nothing = np.zeros((number, 1), dtype=bool)
+        begins, ends = (values.get(key, nothing).any(-1) for key in (self.init_key, self.done_key))
+        numbers = np.arange(begin, self._written)
+        ids = np.concatenate([values[key] for key in keys], axis=1)
+        if self.mask_key in values:
+            valid = values[self.mask_key].any(-1)
+            numbers, ids, begins, ends = numbers[valid], ids[valid], begins[valid], ends[valid]
+        self._trajectories.extend(numbers, ids, begins, ends)
 
-    def _forget(self, oldest: int) -> None:
-        start, stride, length, _ = self._segments.view()
-        alive = start + stride * (length - 1) >= oldest
-        if len(alive) - alive.sum() > max(64, len(alive) // 2):
-            moved = alive.cumsum() - 1
-            self._open = {key: int(moved[position]) for key, position in self._open.items() if alive[position]}
-            self._segments.keep(alive)
+    def _id_keys(self, stored: TensorDictBase) -> list[NestedKey]:
+        missing = [key for key in self.traj_keys if stored.get(key, None) is None]
+        if not missing:
+            return self.traj_keys
+        if self.traj_keys == [TRAJECTORY] and stored.get(ENV_INDEX, None) is not None:
+            return [ENV_INDEX]
+        raise KeyError(
+            f"StepSliceSampler needs the trajectory id {', '.join(map(repr, missing))} in every row; collect with "
+            "StepCollector or a TorchRL collector (track_traj_ids=True), or pass traj_key=..."
+        )
 
     def state_dict(self) -> dict[str, Any]:
-        """The table of trajectories and the write count."""
-        return {
-            "written": self._written,
-            "followed": self._followed,
-            "segments": torch.from_numpy(self._segments.view().copy()),
-            "open": dict(self._open),
-        }
+        """The trajectories and the write count."""
+        return {"written": self._written, "followed": self._followed, **self._trajectories.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`."""
         self._empty()
         self._written = int(state_dict["written"])
         self._followed = int(state_dict["followed"])
-        table = np.asarray(state_dict["segments"], dtype=np.int64)
-        self._segments.table = np.concatenate([table, np.zeros((len(_Segments.fields), 64), np.int64)], axis=1)
-        self._segments.size = table.shape[1]
-        self._open = {int(key): int(position) for key, position in state_dict["open"].items()}
+        self._trajectories.load_state_dict(state_dict)
 
     def dumps(self, path: str | Path) -> None:
         """Writes :meth:`state_dict` to ``path/slices.pt``."""
@@ -244,7 +285,8 @@ class StepSliceSampler(Sampler):
         self.load_state_dict(torch.load(Path(path) / "slices.pt", weights_only=True))
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}(slice_len={self.slice_len}, uniform_over={self.uniform_over!r})"
+        partial = ", partial=True" if self.partial else ""
+        return f"{type(self).__name__}(slice_len={self.slice_len}, uniform_over={self.uniform_over!r}{partial})"
 
 
 def _device(storage: Storage) -> torch.device | str:

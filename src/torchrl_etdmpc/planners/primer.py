@@ -1,0 +1,45 @@
+"""The warm start's place in an environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import NestedKey, TensorDictBase
+from torchrl.envs import EnvBase, TensorDictPrimer
+
+from torchrl_etdmpc.envs.check import check_spaces
+
+
+class PlanPrimer(TensorDictPrimer):
+    """Zeroes the carried plan at every reset, and compares environment and model at the first one.
+
+    It compares then and not when it is appended, because transforms that come later may mend the environment.
+
+    Args:
+        *args: those of :class:`torchrl.envs.TensorDictPrimer`.
+
+    Keyword Args:
+        spaces (dict): arguments of :func:`~torchrl_etdmpc.envs.check_spaces`: what the planner's model takes.
+        latent_key (NestedKey, optional): an environment that offers this and no observation is planned in from its
+            latents.
+        **kwargs: those of :class:`torchrl.envs.TensorDictPrimer`.
+    """
+
+    def __init__(self, *args: Any, spaces: dict[str, Any], latent_key: NestedKey | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.spaces = spaces
+        self.latent_key = latent_key
+        self._checked = False
+
+    def check(self, env: EnvBase) -> None:
+        """Raises a ``ValueError`` that says what to append if the environment does not fit the planner's model."""
+        written = set(env.full_observation_spec.keys(True, True))
+        imagined = self.latent_key in written and self.spaces["observation_key"] not in written
+        spaces: dict[str, Any] = {**self.spaces, "observation_dim": None} if imagined else self.spaces
+        check_spaces(env, **spaces)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self._checked and self.container is not None:
+            self.check(self.container)
+            self._checked = True
+        return super()._reset(tensordict, tensordict_reset)
