@@ -37,6 +37,9 @@ class Slices(NamedTuple):
     """``[T, B, A]``"""
     plan_scale: Tensor | None
     """``[T, B, A]``"""
+    counts: Tensor | None = None
+    """``[T, B]`` bool: the steps that count; the content of the others has been replaced by harmless values. ``None``:
+    all of them count."""
 
 
 class LatentRollout(NamedTuple):
@@ -121,6 +124,33 @@ def mean_of_head_rows(answers: Tensor, num_heads: int) -> Tensor:
     return torch.cat([answers[:1], answers[1:].unflatten(0, (-1, num_heads)).mean(1)]) if len(answers) > 1 else answers
 
 
+def counted_mean(values: Tensor, counts: Tensor | None) -> Tensor:
+    """Mean over the steps that count, 0 if none does.
+
+    Args:
+        values (Tensor): ``[T, B]``.
+        counts (Tensor, optional): bool, ``[T, B]``. Default: every step counts.
+
+    Returns:
+        Tensor: a scalar.
+
+    >>> counted_mean(torch.tensor([[1.0, 5.0]]), torch.tensor([[True, False]])).item()
+    1.0
+    """
+    if counts is None:
+        return values.mean()
+    return torch.where(counts, values, 0).sum() / counts.sum().clamp_min(1)
+
+
+def _reduced(term: Tensor, counts: Tensor | None, reduction: Reduction) -> Tensor:
+    """A term ``[T, B]`` to a scalar, or to ``[B, T]`` without reduction; steps that do not count are zeros."""
+    if reduction == "mean":
+        return counted_mean(term, counts)
+    if counts is not None:
+        term = torch.where(counts, term, 0)
+    return term.sum() if reduction == "sum" else term.transpose(0, 1)
+
+
 class LatentRolloutLoss(LossModule):
     """Base of the losses that train a :class:`~torchrl_etdmpc.modules.WorldModel` on replayed slices.
 
@@ -128,6 +158,11 @@ class LatentRolloutLoss(LossModule):
     the coefficient buffer ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are.
 
     Networks stay shared with the world model that was passed: the planner that holds it sees every update.
+
+    Padded steps count for nothing: not in losses, gradients, running scale or metrics. The mask is found as TorchRL's
+    losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
+    ``"shifted_valid"``, where the batch has them; or at the key ``loss.loss_mask_key``. A step counts if no step of its
+    slice up to it is masked, since the rollout goes through all of them. Means divide by the number of steps that count.
     """
 
     # TorchRL sums every entry that starts with "loss_" (its Trainer does, and so do users), so the entries must carry
@@ -278,7 +313,7 @@ class LatentRolloutLoss(LossModule):
     def _terms(
         self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Unreduced terms ``[T, B]`` by name, and scalar metrics by name."""
+        """Unreduced terms ``[T, B]`` by name, and metrics by name: scalars, or ``[T, B]`` to take the mean of."""
 
     def _key(self, name: str) -> NestedKey:
         key = getattr(self.tensor_keys, name.removeprefix("next_"))
@@ -318,7 +353,6 @@ class LatentRolloutLoss(LossModule):
                 world model has no termination head. Elsewhere that check would wait for the device and is skipped.
             KeyError: if a key is missing.
         """
-        self._refuse_termination(tensordict)
         fields: dict[str, Any] = dict.fromkeys(Slices._fields)
         for name in self._reads:
             value = tensordict.get(self._key(name), None)
@@ -334,18 +368,48 @@ class LatentRolloutLoss(LossModule):
                     f"{self._key(name)!r} of shape {list(value.shape)}; reshape a flat replay sample with "
                     "sample.reshape(-1, slice_len)."
                 )
+            fields[name] = value
+        counts = self._counted_steps(tensordict, fields["action"].shape[:2])
+        self._refuse_termination(tensordict, counts)
+        for name in self._reads:
+            value = fields[name]
+            if counts is not None:
+                # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
+                harmless = torch.ones_like if name == "plan_scale" else torch.zeros_like
+                value = torch.where(counts.unsqueeze(-1), value, harmless(value))
             fields[name] = value.transpose(0, 1)
         fields["observation"] = fields["observation"][0]
         for name in ("reward", "terminated"):
             if fields[name] is not None:
                 fields[name] = fields[name].squeeze(-1)
+        fields["counts"] = None if counts is None else counts.transpose(0, 1)
         return Slices(**fields)
 
-    def _refuse_termination(self, tensordict: TensorDictBase) -> None:
+    def _counted_steps(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
+        """The steps up to which nothing in their slice is masked, bool ``[B, T]``; ``None`` without a mask."""
+        counts = None
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, None)
+            if mask is None:
+                continue
+            if mask.numel() != shape.numel() or mask.shape[:2] != shape:
+                raise ValueError(
+                    f"the mask {key!r} must have the shape [B, T]={list(shape)}, got {list(mask.shape)}; set "
+                    "loss.loss_mask_key to the key of another mask, or to None for no mask."
+                )
+            mask = mask.reshape(shape).bool()
+            counts = mask if counts is None else counts & mask
+        return None if counts is None else counts.int().cumprod(1) > 0
+
+    def _refuse_termination(self, tensordict: TensorDictBase, counts: Tensor | None) -> None:
         if self.ignore_termination or self.world_model.termination_head is not None or torch.compiler.is_compiling():
             return
         terminated = tensordict.get(self._key("terminated"), None)
-        if terminated is not None and terminated.device.type == "cpu" and terminated.any():
+        if terminated is None or terminated.device.type != "cpu":
+            return
+        if counts is not None:
+            terminated = terminated.squeeze(-1) & counts
+        if terminated.any():
             raise ValueError(
                 f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
                 "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
@@ -361,17 +425,14 @@ class LatentRolloutLoss(LossModule):
 
         Returns:
             TensorDictBase: ``loss_*`` entries (scalars, or ``[B, T]`` with ``reduction="none"``), weighted by their
-            coefficients and by ``rho^k`` at step k, and detached scalar metrics.
+            coefficients and by ``rho^k`` at step k, and detached scalar metrics. Means are over the steps that count.
 
         Raises:
             ValueError: as :meth:`slices`.
             KeyError: if a key is missing.
         """
-
-        def reduce(term: Tensor) -> Tensor:
-            return self._reduce_loss(term.transpose(0, 1), tensordict)
-
-        out = TensorDict(self.evaluate(self.slices(tensordict), self.target_values(), reduce), batch_size=[])
+        terms = self.evaluate(self.slices(tensordict), self.target_values(), self.reduction)
+        out = TensorDict(terms, batch_size=[])
         self._clear_weakrefs(tensordict, out)
         return out
 
@@ -384,17 +445,14 @@ class LatentRolloutLoss(LossModule):
         return {dotted: targets.get(name).data for name, dotted in names}
 
     def evaluate(
-        self,
-        slices: Slices,
-        target_values: dict[str, Tensor] | None,
-        reduce: Callable[[Tensor], Tensor] = torch.mean,
+        self, slices: Slices, target_values: dict[str, Tensor] | None, reduction: Reduction = "mean"
     ) -> dict[str, Tensor]:
         """What :meth:`forward` returns, from plain tensors: the part that compiles as one graph.
 
         Args:
             slices (Slices): from :meth:`slices`.
             target_values (dict): from :meth:`target_values`.
-            reduce (callable): a term ``[T, B]`` to a loss. Default: its mean.
+            reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
         Returns:
             dict: ``loss_*`` terms weighted by their coefficients, and detached metrics.
@@ -408,9 +466,13 @@ class LatentRolloutLoss(LossModule):
                     f"extra_terms[{name!r}] must return an error of shape [T, B]={list(slices.action.shape[:2])}, got "
                     f"{list(error.shape)}."
                 )
-            terms[name], metrics[f"{name}_error"] = self._discount_depth(error), error.mean()
-        out = {f"loss_{name}": getattr(self, f"{name}_coef") * reduce(term) for name, term in terms.items()}
-        out.update({name: metric.detach() for name, metric in metrics.items()})
+            terms[name], metrics[f"{name}_error"] = self._discount_depth(error), error
+        out = {
+            f"loss_{name}": getattr(self, f"{name}_coef") * _reduced(term, slices.counts, reduction)
+            for name, term in terms.items()
+        }
+        for name, metric in metrics.items():
+            out[name] = (counted_mean(metric, slices.counts) if metric.ndim else metric).detach()
         return out
 
     def _discount_depth(self, error: Tensor) -> Tensor:

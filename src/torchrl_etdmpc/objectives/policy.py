@@ -147,11 +147,12 @@ def policy_terms(
     latent = head_rows(rollout.predicted[:-1])
     plan = head_rows(slices.plan_loc, heads), head_rows(slices.plan_scale, heads)
     kl, entropy = distillation(loss.world_model, latent, *plan, kl_direction=loss.kl_direction)
+    first = None if slices.counts is None else slices.counts[0]
     # Departure from BMPC, which moves the scale in every policy step: an evaluation of the loss must not change it.
     if loss.training:
-        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau))
+        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau, first))
     scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
     term = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
-    policy_kl, policy_entropy = (mean_of_head_rows(value, heads).mean() for value in (kl, entropy))
+    policy_kl, policy_entropy = (mean_of_head_rows(value, heads) for value in (kl, entropy))
     metrics = {"policy_kl": policy_kl, "policy_entropy": policy_entropy, "kl_scale": scale}
     return {"policy": loss._discount_depth(mean_of_head_rows(term, heads))}, metrics

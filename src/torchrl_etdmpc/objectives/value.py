@@ -162,4 +162,4 @@ def value_terms(
         world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
     )
     error = value_error(world_model, rollout, target, dropout=loss.training)
-    return {"value": loss._discount_depth(error)}, {"value_error": error.mean(), "value_target": target.mean()}
+    return {"value": loss._discount_depth(error)}, {"value_error": error, "value_target": target}

@@ -155,4 +155,4 @@ def model_terms(
     # last of its slice and a decay would bias the probability.
     if loss.world_model.termination_head is not None:
         terms["termination"] = errors["termination"] = termination_error(loss.world_model, rollout, slices)
-    return terms, {f"{name}_error": error.mean() for name, error in errors.items()}
+    return terms, {f"{name}_error": error for name, error in errors.items()}

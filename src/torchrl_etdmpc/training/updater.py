@@ -109,7 +109,7 @@ class Updater:
         """One update.
 
         Args:
-            batch (TensorDictBase): slices, batch size [B, T]; priorities and masks are not read.
+            batch (TensorDictBase): slices, batch size [B, T].
             distill (bool): whether to train the policy (pretraining does not).
 
         Returns:
