@@ -43,7 +43,17 @@ def test_the_scale_approaches_a_constant_spread():
 
 def test_the_scale_is_never_below_one():
     assert updated_scale(torch.tensor(1.0), torch.zeros(10), tau=1.0) == 1
-    assert updated_scale(torch.tensor(1.5), torch.full((10,), 42.0), tau=0.9) == 1
+    assert updated_scale(torch.tensor(1.5), torch.full((10,), 42.0), tau=1.0) == 1
+
+
+def test_a_batch_of_little_spread_counts_as_a_spread_of_one():
+    scale = torch.tensor(1.0, dtype=torch.float64)
+    expected = 1.0
+    for spread in (0.2, 2.2) * 50:
+        scale = updated_scale(scale, torch.linspace(0, spread / 0.9, 101, dtype=torch.float64), tau=0.1)
+        expected = 0.9 * expected + 0.1 * max(spread, 1.0)
+        assert scale.item() == pytest.approx(expected, rel=1e-12)
+    assert scale > 1.5  # its average; 1.2 is that of the spreads themselves
 
 
 def test_the_extreme_twentieths_of_the_batch_have_no_influence():

@@ -7,12 +7,12 @@ from torch import Tensor
 
 
 def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | None = None) -> Tensor:
-    """Moves a running scale towards the spread between a batch's 5th and 95th percentile, never below 1.
+    """Moves a running scale towards the spread between a batch's 5th and 95th percentile, or towards 1 if that is less.
 
-    ``S <- max((1 - tau) S + tau (p95 - p5), 1)`` (TD-MPC2, arXiv:2310.16828; BMPC applies it to the KL).
+    ``S <- (1 - tau) S + tau max(p95 - p5, 1)`` (TD-MPC2, arXiv:2310.16828; BMPC applies it to the KL).
 
     Args:
-        scale (Tensor): the present scale, a scalar.
+        scale (Tensor): the present scale, a scalar, at least 1.
         batch (Tensor): values of one batch, any shape.
         tau (float): rate of the exponential moving average, in [0, 1].
         counts (Tensor, optional): which values count, bool, the batch's shape. Default: all of them.
@@ -32,5 +32,5 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | Non
         # What does not count becomes NaN, which nanquantile leaves out; a NaN that counts must not be left out.
         finite = (batch.isfinite() | ~counts.flatten()).all()
         quantiles = torch.nanquantile(torch.where(counts.flatten() & finite, batch, torch.nan), levels)
-    spread = (quantiles[1] - quantiles[0]).to(scale.dtype)
-    return torch.lerp(scale, torch.where(spread.isfinite(), spread, scale), tau).clamp_min(1.0)
+    spread = (quantiles[1] - quantiles[0]).to(scale.dtype).clamp_min(1.0)
+    return torch.lerp(scale, torch.where(spread.isfinite(), spread, scale), tau)

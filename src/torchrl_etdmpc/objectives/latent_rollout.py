@@ -162,7 +162,7 @@ class LatentRolloutLoss(LossModule):
     Padded steps count for nothing: not in losses, gradients, running scale or metrics. The mask is found as TorchRL's
     losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
     ``"shifted_valid"``, where the batch has them; or at the key ``loss.loss_mask_key``. A step counts if no step of its
-    slice up to it is masked, since the rollout goes through all of them. Means divide by the number of steps that count.
+    slice up to it is masked, since the rollout goes through all of them; means divide by the number of those.
     """
 
     # TorchRL sums every entry that starts with "loss_" (its Trainer does, and so do users), so the entries must carry
@@ -194,6 +194,7 @@ class LatentRolloutLoss(LossModule):
     default_value_estimator = None  # pyright: ignore[reportAssignmentType]
 
     world_model: WorldModel
+    reduction: Reduction  # pyright: ignore[reportIncompatibleVariableOverride]
     rho: Tensor
     # Each loss has what its networks and terms need of the following.
     encoder: nn.Module

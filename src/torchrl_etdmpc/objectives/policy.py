@@ -64,8 +64,8 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
     """Distils the planner into the policy (thesis Eq. 2.17; BMPC, arXiv:2503.18871).
 
     On the detached rollout latents, ``KL(pi || plan) / S - entropy_coef * entropy * A`` with the KL averaged over
-    action dimensions; S is a running scale of the KL (5th to 95th percentile at k = 0, never below 1), moved only in
-    training mode. Trains the policy alone.
+    action dimensions; S is a running scale of the KL (5th to 95th percentile at k = 0, at least 1), moved only
+    in training mode. Trains the policy alone.
 
     Args:
         world_model (WorldModel): the networks, shared with the caller.

@@ -13,6 +13,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Slices
 from torchrl_etdmpc.training.compilation import compile_call, tracing_gradients
 
+_CLIPPED_TOGETHER = {"model": ("encoder", "heads", "values"), "policy": ("policy",)}
 _ALIGNMENT = 16  # elements: every parameter begins at a multiple of 64 bytes, as memory of its own would
 
 
@@ -23,8 +24,8 @@ class Updater:
     the summed loss is the model step followed by the policy step on the detached latents. The gradients of the two are
     clipped separately; Adam with ``eps=1e-5`` serves the policy (TD-MPC2).
 
-    An update whose gradient is not finite is skipped: weights and optimiser stay as they are, and ``skipped`` and
-    ``skipped_in_a_row`` count it, on the device.
+    Where the model's gradient is not finite the update is skipped: weights and optimiser stay as they are. Where only
+    the policy's is not, the policy alone stays. ``skipped`` and ``skipped_in_a_row`` count both, on the device.
 
     The weights of each part move into one piece of memory, of which the parameters become views, so that clipping, Adam
     and the target average are a few operations whatever the number of layers. Parameters that get new memory afterwards
@@ -128,15 +129,17 @@ class Updater:
         else:
             with tracing_gradients():
                 metrics, gradients, skip = self._compiled(*inputs)
-        for part, gradient in gradients.items():
-            self._flat[part].grad = gradient
-        # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
-        self.optimizer.grad_scale = None  # pyright: ignore[reportAttributeAccessIssue]
-        self.optimizer.found_inf = skip  # pyright: ignore[reportAttributeAccessIssue]
-        self.optimizer.step()
-        self.optimizer.zero_grad()
-        self.skipped += skip.long()
-        self.skipped_in_a_row.add_(1).mul_(skip.long())
+        for name, not_finite in skip.items():
+            for part in _CLIPPED_TOGETHER[name]:
+                self._flat[part].grad = gradients[part]
+            # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
+            self.optimizer.grad_scale = None  # pyright: ignore[reportAttributeAccessIssue]
+            self.optimizer.found_inf = not_finite  # pyright: ignore[reportAttributeAccessIssue]
+            self.optimizer.step()
+            self.optimizer.zero_grad()
+        skipped = torch.stack(list(skip.values())).amax().long()
+        self.skipped += skipped
+        self.skipped_in_a_row.add_(1).mul_(skipped)
         self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
         self.loss.world_model.version += 1
         return TensorDict(metrics, batch_size=[]).clone()
@@ -164,8 +167,8 @@ class Updater:
 
     def _gradients(
         self, slices: Slices, target_values: dict[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-        """Losses and metrics, the clipped gradient of the summed losses in the layout of each part, and 1.0 to skip.
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
+        """Losses and metrics, clipped gradients of the sum in the layout of each part, and 1.0 for what to skip.
 
         All of it is one graph when it is compiled, so nothing here may wait for the device or depend on a value.
         """
@@ -174,15 +177,17 @@ class Updater:
         out = self.loss.evaluate(slices, target_values)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
-        clipped = {"model": ("encoder", "heads", "values")} | ({"policy": ("policy",)} if self.loss.distill else {})
+        clipped = {name: parts for name, parts in _CLIPPED_TOGETHER.items() if self.loss.distill or name != "policy"}
         gradients = self._flat_gradients(total, [part for names in clipped.values() for part in names])
         for name, names in clipped.items():
             norm = torch.stack([gradients[part].norm() for part in names]).norm()
             factor = (self.grad_clip_norm / (norm + 1e-6)).clamp(max=1)  # as torch.nn.utils.clip_grad_norm_
             gradients.update({part: factor * gradients[part] for part in names})
             metrics[f"grad_norm_{name}"] = norm
-        norms = torch.stack([metrics[f"grad_norm_{name}"] for name in clipped])
-        return metrics, gradients, norms.isfinite().all().logical_not().float()
+        skip = {name: metrics[f"grad_norm_{name}"].isfinite().logical_not().float() for name in clipped}
+        if "policy" in skip:
+            skip["policy"] = torch.maximum(skip["policy"], skip["model"])
+        return metrics, gradients, skip
 
     def _flat_gradients(self, total: Tensor, parts: list[str]) -> dict[str, Tensor]:
         """The gradient of each part, in the layout of its piece of memory."""
