@@ -170,7 +170,7 @@ def test_an_update_reads_the_mask_too(make_loss, make_world_model, slices):
 
 def test_a_compiled_loss_reads_the_mask_in_one_graph(make_loss, world_model, slices):
     loss = make_loss("whole", world_model)
-    inputs = loss.slices(_pad(slices, float("nan"))), loss.target_values()
+    inputs = loss.slices(_pad(slices, float("nan"))), loss.targets()
     expected, scale = loss.eval().evaluate(*inputs), loss.train().kl_scale.clone()
     assert torch.compile(loss.evaluate, fullgraph=True, backend="eager")(*inputs)["loss_policy"].isfinite()
     assert loss.kl_scale.isfinite() and loss.kl_scale != scale

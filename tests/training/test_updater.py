@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._pytree import tree_map_only
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.functional import updated_scale
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Term
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
 
@@ -137,6 +137,60 @@ def test_the_parts_share_the_weights_out_between_them():
         ("policy", world_model.policy),
     ):
         assert parts[name] == {id(p) for p in module.parameters()}
+
+
+class Decoder(nn.Module):
+    """A term with networks of its own, one of which is the world model's."""
+
+    def __init__(self, world_model: WorldModel) -> None:
+        super().__init__()
+        self.encoder, self.decoder, self.scale = world_model.encoder, nn.Linear(16, 5), nn.Parameter(torch.ones(()))
+
+    def forward(self, world_model, slices, rollout):
+        return (self.scale * self.decoder(rollout.predicted[1:])).square().mean((1, -1))
+
+
+def test_every_parameter_of_the_loss_is_trained_once():
+    world_model = make_world_model(termination=True)
+    updater = make_updater(world_model, extra_terms=[Term("decoder", Decoder(world_model))])
+    trained = [id(parameter) for part in updater.parts.values() for parameter in part]
+    assert len(trained) == len(set(trained))
+    assert set(trained) == {id(parameter) for parameter in updater.loss.parameters()}
+    before = {name: parameter.clone() for name, parameter in updater.loss.named_parameters()}
+    seeded_step(updater, make_batch())
+    assert [name for name, p in updater.loss.named_parameters() if torch.equal(p, before[name])] == []
+
+
+def test_a_frozen_parameter_stays_as_it_is():
+    world_model = make_world_model()
+    term = Term("decoder", Decoder(world_model))
+    term.function.decoder.requires_grad_(False)
+    before = term.function.decoder.weight.clone()
+    updater = make_updater(world_model, extra_terms=[term])
+    seeded_step(updater, make_batch())
+    assert torch.equal(term.function.decoder.weight, before)
+    assert term.function.scale != 1
+
+
+def test_a_parameter_of_another_dtype_is_refused_with_the_network_that_has_it():
+    world_model = make_world_model()
+    term = Term("decoder", Decoder(world_model))
+    term.function.decoder.float()
+    with pytest.raises(
+        ValueError, match=r"^all parameters of the loss must be torch.float64 on cpu as its"
+    ):
+        make_updater(world_model, extra_terms=[term])
+
+
+def test_a_parameter_that_no_term_reads_is_an_error_that_names_it():
+    world_model = make_world_model()
+    term = Term("decoder", Decoder(world_model))
+    term.function.forgotten = nn.Linear(2, 2)
+    updater = make_updater(world_model, extra_terms=[term])
+    with pytest.raises(
+        RuntimeError, match=r"^no term sends a gradient into decoder.forgotten.weight, decoder"
+    ):
+        seeded_step(updater, make_batch())
 
 
 def test_every_parameter_begins_where_memory_of_its_own_could():

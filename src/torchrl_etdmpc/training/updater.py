@@ -27,6 +27,9 @@ class Updater:
     Where the model's gradient is not finite the update is skipped: weights and optimiser stay as they are. Where only
     the policy's is not, the policy alone stays. ``skipped`` and ``skipped_in_a_row`` count both, on the device.
 
+    Every parameter of the loss is trained, also those that a term of the user's own brings; these are clipped with the
+    model's. A frozen parameter (``requires_grad_(False)``) stays as it is.
+
     The weights of each part move into one piece of memory, of which the parameters become views, so that clipping, Adam
     and the target average are a few operations whatever the number of layers. Parameters that get new memory afterwards
     (``.to()``, ``copy.deepcopy``) need a new updater; :meth:`step` says so.
@@ -43,7 +46,7 @@ class Updater:
             eager. An update without distillation is always eager: pretraining is short.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or parameters differ in dtype or device.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.testing import random_slices
@@ -73,16 +76,10 @@ class Updater:
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
         SoftUpdate(loss, tau=tau)  # tells the loss that its targets follow
+        self.parts = _parts(loss)
+        self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         values = dict(loss.value_params.flatten_keys(".").items())
         targets = dict(loss.target_value_params.flatten_keys(".").items())
-        heads = [name for name in ("dynamics", "reward", "termination") if f"{name}_params" in loss._modules]
-        self.parts: dict[str, list[nn.Parameter]] = {
-            "encoder": list(loss.encoder_params.parameters()),
-            "heads": [p for name in heads for p in getattr(loss, f"{name}_params").parameters()],
-            "values": list(values.values()),
-            "policy": list(loss.policy_params.parameters()),
-        }
-        self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         self._flat_targets = _moved_together([targets[name] for name in values])
         self._views = [p for tensors in self.parts.values() for p in tensors]
         self._addresses = [p.data_ptr() for p in self._views]
@@ -123,7 +120,7 @@ class Updater:
             raise RuntimeError("the loss's parameters have been moved; make a new Updater for this loss.")
         if self.loss.distill != distill:
             self.loss.distill = distill
-        inputs = self.loss.slices(batch), self.loss.target_values()
+        inputs = self.loss.slices(batch), self.loss.targets()
         if self._compiled is None or not distill:
             metrics, gradients, skip = self._gradients(*inputs)
         else:
@@ -156,7 +153,7 @@ class Updater:
         self.loss.distill = True
         try:
             with tracing_gradients():
-                self._compiled(self.loss.slices(batch), self.loss.target_values())
+                self._compiled(self.loss.slices(batch), self.loss.targets())
         finally:
             self.loss.kl_scale.copy_(scale)
             self.loss.distill = distill
@@ -166,7 +163,7 @@ class Updater:
         self._compiled = None
 
     def _gradients(
-        self, slices: Slices, target_values: dict[str, Tensor] | None
+        self, slices: Slices, targets: dict[str, dict[str, Tensor]]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
         """Losses and metrics, clipped gradients of the sum in the layout of each part, and 1.0 for what to skip.
 
@@ -174,7 +171,7 @@ class Updater:
         """
         # Departure from BMPC and TD-MPC2, which make two backward passes, the model's and then the policy's: neither
         # loss sends a gradient into what the other one trains, so the gradient of the sum is both.
-        out = self.loss.evaluate(slices, target_values)
+        out = self.loss.evaluate(slices, targets)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
         clipped = {name: parts for name, parts in _CLIPPED_TOGETHER.items() if self.loss.distill or name != "policy"}
@@ -191,7 +188,16 @@ class Updater:
 
     def _flat_gradients(self, total: Tensor, parts: list[str]) -> dict[str, Tensor]:
         """The gradient of each part, in the layout of its piece of memory."""
-        every = iter(torch.autograd.grad(total, [p for part in parts for p in self.parts[part]]))
+        parameters = [p for part in parts for p in self.parts[part]]
+        found = torch.autograd.grad(total, parameters, allow_unused=True)
+        if any(gradient is None for gradient in found):
+            names = {id(parameter): name for name, parameter in self.loss.named_parameters()}
+            unread = [names[id(p)] for p, gradient in zip(parameters, found, strict=True) if gradient is None]
+            raise RuntimeError(
+                f"no term sends a gradient into {', '.join(unread)}; freeze what is not to be trained with "
+                "requires_grad_(False) before making the Updater."
+            )
+        every = iter(found)
         return {part: _joined([next(every) for _ in self.parts[part]]) for part in parts}
 
     def state_dict(self) -> dict[str, Any]:
@@ -204,6 +210,23 @@ class Updater:
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
+
+
+def _parts(loss: EfficientTDMPCLoss) -> dict[str, list[nn.Parameter]]:
+    """The parameters by how they are trained: what has no rule of its own is trained as the heads are."""
+    parts: dict[str, list[nn.Parameter]] = {"encoder": [], "heads": [], "values": [], "policy": []}
+    first = next(loss.parameters())
+    for network, parameters in loss.network_parameters().items():
+        part = {"encoder": "encoder", "value": "values", "policy": "policy"}.get(network, "heads")
+        for parameter in parameters:
+            if (parameter.dtype, parameter.device) != (first.dtype, first.device):
+                raise ValueError(
+                    f"all parameters of the loss must be {first.dtype} on {first.device} as its first one, got "
+                    f"{parameter.dtype} on {parameter.device} in {network!r}; move the loss as a whole: loss.to(...)."
+                )
+            if parameter.requires_grad:
+                parts[part].append(parameter)
+    return parts
 
 
 def _joined(tensors: Sequence[Tensor]) -> Tensor:
