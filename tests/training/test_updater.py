@@ -176,9 +176,7 @@ def test_a_parameter_of_another_dtype_is_refused_with_the_network_that_has_it():
     world_model = make_world_model()
     term = Term("decoder", Decoder(world_model))
     term.function.decoder.float()
-    with pytest.raises(
-        ValueError, match=r"^all parameters of the loss must be torch.float64 on cpu as its"
-    ):
+    with pytest.raises(ValueError, match=r"^all parameters of the loss must be torch.float64 on cpu as its"):
         make_updater(world_model, extra_terms=[term])
 
 
@@ -187,9 +185,7 @@ def test_a_parameter_that_no_term_reads_is_an_error_that_names_it():
     term = Term("decoder", Decoder(world_model))
     term.function.forgotten = nn.Linear(2, 2)
     updater = make_updater(world_model, extra_terms=[term])
-    with pytest.raises(
-        RuntimeError, match=r"^no term sends a gradient into decoder.forgotten.weight, decoder"
-    ):
+    with pytest.raises(RuntimeError, match=r"^no term sends a gradient into decoder.forgotten.weight, decoder"):
         seeded_step(updater, make_batch())
 
 

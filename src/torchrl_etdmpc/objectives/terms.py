@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, counted_mean, latent_rollout
+from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
 
 Reduction = Literal["none", "mean", "sum"]
 KLDirection = Literal["backward", "forward"]
@@ -115,7 +116,9 @@ class LatentRolloutLoss(LossModule):
     ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are. A coefficient is assigned like a number
     (``loss.reward_coef = 0.3``), in place.
 
-    Networks stay shared with the world model that was passed: the planner that holds it sees every update.
+    Networks stay shared with the world model that was passed: the planner that holds it sees every update. Every step
+    of a PyTorch optimiser that trains them counts as one in ``world_model.version``, which dates the planner's targets
+    and is part of this loss' state.
 
     Padded steps count for nothing: not in losses, gradients, running scale or metrics. The mask is found as TorchRL's
     losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
@@ -239,6 +242,7 @@ class LatentRolloutLoss(LossModule):
                 self.add_module(term.name, term.function)
         self.register_buffer("rho", torch.tensor(float(rho)))
         self.ignore_termination = ignore_termination
+        count_updates(world_model, self.parameters())
 
     def __setattr__(self, name: str, value: Any) -> None:
         # TorchRL has a list of such buffers for a class; here each loss has those of its terms.
@@ -265,6 +269,19 @@ class LatentRolloutLoss(LossModule):
         for name in self._attributes:
             if f"{name}_params" in self._modules:
                 self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
+        count_updates(self.world_model, self.parameters())
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        # The world model is not a submodule, but who restores the weights restores the number of updates in them.
+        destination[f"{prefix}version"] = self.world_model.version.detach()
+
+    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        version = state_dict.get(f"{prefix}version")
+        super()._load_from_state_dict({k: v for k, v in state_dict.items() if k != f"{prefix}version"}, prefix, *args)
+        if version is not None:  # files of before do not have it
+            self.world_model.version.copy_(version)
+            restart_count(self.world_model)
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones."""
