@@ -160,7 +160,6 @@ def test_the_parts_learn_in_a_pipeline_of_torchrl_s_own_with_other_keys():
         optimizer.step()
         optimizer.zero_grad()
         target_update.step()
-        model.version += 1
     last = terms(fixed)
     assert set(first) == {"loss_consistency", "loss_reward", "loss_value", "loss_policy"}
     assert all(value.isfinite() for value in last.values())

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etdmpc import EfficientTDMPCLoss, EnsembleMPPIPlanner, LatentEnv, WorldModel
 from torchrl_etdmpc.envs import Task, import_task, make_env, register_task
-from torchrl_etdmpc.objectives import ExtraTerm, LatentRollout, Slices
+from torchrl_etdmpc.objectives import LatentRollout, Slices, Term
 from torchrl_etdmpc.planners import make_score
 from torchrl_etdmpc.runs import RunDirectory, RunLog
 from torchrl_etdmpc.testing import random_slices
@@ -213,7 +213,7 @@ def test_a_new_loss_term():
     for coef in (0.0, 100.0):
         torch.manual_seed(0)
         model = WorldModel(3, 2, latent_dim=16, mlp_dim=16, encoder_dim=16)
-        terms = {"calm": ExtraTerm(calm_policy, coef)}
+        terms = [Term("calm", calm_policy, coef)]
         updater = Updater(EfficientTDMPCLoss(model, discount=0.99, extra_terms=terms), lr=1e-2)
         batch = random_slices(3, 2, num_slices=8)
         for _ in range(30):

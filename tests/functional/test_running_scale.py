@@ -43,7 +43,17 @@ def test_the_scale_approaches_a_constant_spread():
 
 def test_the_scale_is_never_below_one():
     assert updated_scale(torch.tensor(1.0), torch.zeros(10), tau=1.0) == 1
-    assert updated_scale(torch.tensor(1.5), torch.full((10,), 42.0), tau=0.9) == 1
+    assert updated_scale(torch.tensor(1.5), torch.full((10,), 42.0), tau=1.0) == 1
+
+
+def test_a_batch_of_little_spread_counts_as_a_spread_of_one():
+    scale = torch.tensor(1.0, dtype=torch.float64)
+    expected = 1.0
+    for spread in (0.2, 2.2) * 50:
+        scale = updated_scale(scale, torch.linspace(0, spread / 0.9, 101, dtype=torch.float64), tau=0.1)
+        expected = 0.9 * expected + 0.1 * max(spread, 1.0)
+        assert scale.item() == pytest.approx(expected, rel=1e-12)
+    assert scale > 1.5  # its average; 1.2 is that of the spreads themselves
 
 
 def test_the_extreme_twentieths_of_the_batch_have_no_influence():
@@ -73,3 +83,24 @@ def test_no_gradient_passes_and_the_old_scale_is_left_alone():
 
 def test_the_scale_keeps_its_own_dtype():
     assert updated_scale(torch.tensor(1.0), torch.linspace(0, 9, 10, dtype=torch.float64), 0.5).dtype == torch.float32
+
+
+@pytest.mark.parametrize("junk", [0.0, 1e9, float("nan"), float("inf")])
+def test_what_does_not_count_has_no_influence(junk):
+    batch = 10 * torch.randn(30, dtype=torch.float64)
+    counts = torch.arange(30) % 3 > 0
+    expected = updated_scale(torch.tensor(2.0, dtype=torch.float64), batch[counts], 0.5)
+    padded = torch.where(counts, batch, junk)
+    torch.testing.assert_close(updated_scale(torch.tensor(2.0, dtype=torch.float64), padded, 0.5, counts), expected)
+
+
+def test_a_batch_in_which_nothing_counts_leaves_the_scale_where_it_is():
+    nothing = torch.zeros(9, dtype=torch.bool)
+    assert updated_scale(torch.tensor(7.0), torch.linspace(0, 1000, 9), 0.5, nothing) == 7
+
+
+@pytest.mark.parametrize("counts", [None, torch.arange(9) < 8])
+def test_a_nan_that_counts_leaves_the_scale_where_it_is(counts):
+    batch = torch.linspace(0, 1000, 9)
+    batch[3] = torch.nan
+    assert updated_scale(torch.tensor(7.0), batch, 0.5, counts) == 7

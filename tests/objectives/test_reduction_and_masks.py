@@ -1,7 +1,15 @@
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.training import Updater
 
 
 def test_the_reductions_agree_with_each_other(make_loss, world_model, kind, slices, run_seeded, terms_of, metrics_of):
@@ -41,8 +49,7 @@ def test_entry_b_k_of_an_unreduced_term_belongs_to_slice_b(make_loss, world_mode
 @pytest.mark.parametrize("mask_key", [("collector", "mask"), "shifted_valid"])
 @pytest.mark.parametrize("trailing", [(), (1,)])
 def test_masked_steps_do_not_count(make_loss, world_model, kind, slices, run_seeded, mask_key, trailing, terms_of):
-    mask = torch.rand(4, 3) < 0.5
-    mask[0] = True
+    mask = torch.arange(3) < torch.tensor([[3], [1], [0], [2]])
     loss = make_loss(kind, world_model, reduction="none").eval()
     unmasked = run_seeded(loss, slices)
     slices[mask_key] = mask.view(4, 3, *trailing)
@@ -60,34 +67,161 @@ def test_masked_steps_do_not_count(make_loss, world_model, kind, slices, run_see
     assert all(torch.equal(again[key], unmasked[key]) for key in unmasked.keys())
 
 
+@pytest.mark.parametrize("mask_key", [("collector", "mask"), "shifted_valid"])
+def test_a_step_behind_a_masked_one_does_not_count_since_its_rollout_goes_through_it(
+    loss, slices, run_seeded, assert_same_output, mask_key
+):
+    slices[mask_key] = torch.tensor([[1, 1, 1], [1, 0, 1], [0, 1, 1], [0, 0, 1]]).bool()
+    with_gaps = run_seeded(loss.eval(), slices)
+    slices[mask_key] = torch.tensor([[1, 1, 1], [1, 0, 0], [0, 0, 0], [0, 0, 0]]).bool()
+    assert_same_output(with_gaps, run_seeded(loss, slices), rtol=0, atol=0)
+
+
 def _pad(slices, fill):
-    """Masks the last two steps of slice 1 and the last of slice 2, and fills them."""
+    """Masks the last two steps of slice 1, the last of slice 2 and the whole of slice 3, and fills them."""
     mask = torch.ones(4, 3, 1, dtype=torch.bool)
-    mask[1, 1:] = mask[2, 2:] = False
+    mask[1, 1:] = mask[2, 2:] = mask[3] = False
     padded = slices.clone()
     padded["collector", "mask"] = mask
-    # The first masked step's own observation is the last valid one's successor: it is real.
-    for key in ("action", ("next", "observation"), ("next", "reward"), ("plan", "loc"), ("plan", "scale")):
+    for key in (
+        "observation",
+        "action",
+        ("next", "observation"),
+        ("next", "reward"),
+        ("plan", "loc"),
+        ("plan", "scale"),
+    ):
         padded[key] = torch.where(mask, padded[key], fill)
     padded["next", "terminated"] &= mask
     return padded
 
 
-@pytest.mark.parametrize("fill", [1.0, 30.0])
-def test_the_content_of_a_padded_tail_reaches_neither_terms_nor_gradients(
-    make_loss, world_model, kind, slices, run_seeded, gradients, assert_same_gradients, fill, total, terms_of
+@pytest.mark.parametrize("fill", [0.0, 30.0, float("nan"), float("inf")])
+def test_padded_steps_influence_neither_terms_nor_metrics_nor_gradients_nor_the_running_scale(
+    make_loss, world_model, kind, slices, run_seeded, gradients, assert_same_output, total, fill
 ):
-    loss = make_loss(kind, world_model).eval()
-    expected, actual = run_seeded(loss, _pad(slices, 0.5)), run_seeded(loss, _pad(slices, fill))
-    for term in terms_of[kind]:
-        torch.testing.assert_close(actual[f"loss_{term}"], expected[f"loss_{term}"])
-    expected, actual = gradients(total(expected), world_model), gradients(total(actual), world_model)
-    assert_same_gradients(actual, expected)
+    loss = make_loss(kind, world_model)
+    other = copy.deepcopy(loss)
+    assert loss.training
+    expected, actual = run_seeded(loss, _pad(slices, 0.5)), run_seeded(other, _pad(slices, fill))
+    assert_same_output(actual, expected, rtol=0, atol=0)
+    assert all(value.isfinite().all() for value in actual.values())
+    if kind in ("whole", "policy"):
+        assert torch.equal(loss.kl_scale, other.kl_scale)
+    expected, actual = gradients(total(expected), world_model), gradients(total(actual), other.world_model)
+    for network, parameters in expected.items():
+        for name, gradient in parameters.items():
+            if gradient is None:
+                assert actual[network][name] is None
+            else:
+                assert gradient.isfinite().all()
+                assert torch.equal(actual[network][name], gradient), (network, name)
 
 
-def test_a_nan_in_a_padded_tail_does_not_reach_the_terms(make_loss, world_model, kind, slices, run_seeded, terms_of):
-    # The terms only: 0 * nan is nan in the backward pass, so padding must be finite (and a scale positive) to train on.
-    loss = make_loss(kind, world_model).eval()
-    expected, actual = run_seeded(loss, _pad(slices, 0.5)), run_seeded(loss, _pad(slices, float("nan")))
-    for term in terms_of[kind]:
-        torch.testing.assert_close(actual[f"loss_{term}"], expected[f"loss_{term}"])
+@pytest.mark.usefixtures("double_precision")
+@pytest.mark.parametrize("kind", ["model", "policy"])  # their training draws nothing
+def test_slices_of_padding_alone_are_as_good_as_not_there(
+    make_loss, make_world_model, make_slices, kind, gradients, assert_same_output, total
+):
+    slices = make_slices(num_slices=20)
+    slices["plan", "scale"] *= 0.05
+    world_model = make_world_model(termination=True)
+    loss = make_loss(kind, world_model, **({"scale_tau": 0.5} if kind == "policy" else {}))
+    other = copy.deepcopy(loss)
+    expected = loss(slices[:12])
+    slices["collector", "mask"] = (torch.arange(20) < 12).unsqueeze(-1).expand(20, 3)
+    for key in (("plan", "loc"), ("plan", "scale"), ("next", "reward")):
+        slices[key][12:] = 0
+    actual = other(slices)
+    assert_same_output(actual, expected)
+    if kind == "policy":
+        assert loss.kl_scale > 1.1
+    expected, actual = gradients(total(expected), world_model), gradients(total(actual), other.world_model)
+    torch.testing.assert_close(actual, expected)
+
+
+def test_a_batch_of_padding_alone_is_a_loss_of_zero_and_moves_nothing(make_loss, world_model, kind, slices, total):
+    loss = make_loss(kind, world_model)
+    slices["collector", "mask"] = torch.zeros(4, 3, dtype=torch.bool)
+    out = loss(slices)
+    assert total(out) == 0
+    total(out).backward()
+    assert not any(p.grad.any() for p in loss.parameters() if p.grad is not None)
+    if kind in ("whole", "policy"):
+        assert loss.kl_scale == 1
+
+
+def test_a_mask_of_ones_changes_nothing(loss, slices, run_seeded, assert_same_output):
+    expected = run_seeded(loss.eval(), slices)
+    slices["collector", "mask"] = torch.ones(4, 3, dtype=torch.bool)
+    assert_same_output(run_seeded(loss, slices), expected)
+
+
+def test_an_update_reads_the_mask_too(make_loss, make_world_model, slices):
+    model = make_world_model()
+    updaters = [Updater(make_loss("whole", copy.deepcopy(model))) for _ in range(2)]
+    for updater, fill in zip(updaters, (0.5, float("nan")), strict=True):
+        torch.manual_seed(3)
+        out = updater.step(_pad(slices, fill))
+        assert all(value.isfinite() for value in out.values())
+    for ours, theirs in zip(*(updater.loss.parameters() for updater in updaters), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_a_compiled_loss_reads_the_mask_in_one_graph(make_loss, world_model, slices):
+    loss = make_loss("whole", world_model)
+    inputs = loss.slices(_pad(slices, float("nan"))), loss.targets()
+    expected, scale = loss.eval().evaluate(*inputs), loss.train().kl_scale.clone()
+    assert torch.compile(loss.evaluate, fullgraph=True, backend="eager")(*inputs)["loss_policy"].isfinite()
+    assert loss.kl_scale.isfinite() and loss.kl_scale != scale
+    assert expected["loss_reward"].isfinite()
+
+
+def test_what_terminates_in_the_padding_is_not_refused(make_loss, make_world_model, slices):
+    loss = make_loss("whole", make_world_model(), ignore_termination=False)
+    slices["collector", "mask"] = torch.tensor([[True, True, False]]).expand(4, 3)
+    slices["next", "terminated"] = ~slices["collector", "mask"].unsqueeze(-1)
+    loss(slices)
+    slices["next", "terminated"] = ~slices["next", "terminated"]
+    with pytest.raises(ValueError, match="holds True, but the world model has no termination head"):
+        loss(slices)
+
+
+def test_a_mask_of_another_shape_is_refused_in_a_sentence(loss, slices):
+    slices["collector", "mask"] = torch.ones(4, 3, 2, dtype=torch.bool)
+    with pytest.raises(
+        ValueError,
+        match=r"^the mask \('collector', 'mask'\) must have the shape \[B, T\]=\[4, 3\], got \[4, 3, 2\]; set",
+    ):
+        loss(slices)
+
+
+def test_the_padded_trajectories_of_torchrl_s_collector_train_the_agent(make_loss, make_world_model, total):
+    model = make_world_model(observation_dim=4, action_dim=1, termination=True)
+    planner = EnsembleMPPIPlanner(
+        LatentEnv(model), horizon=2, num_samples=8, num_elites=2, num_proposals=1, iterations=1
+    )
+    env = TransformedEnv(make_env("gym/InvertedPendulum-v5", seed=0), planner.make_tensordict_primer())
+    with pytest.warns(UserWarning, match="zero-padded"):
+        collector = Collector(env, planner, frames_per_batch=60, total_frames=60, split_trajs=True, use_buffers=False)
+    batch = next(iter(collector))
+    collector.shutdown()
+    mask = batch["collector", "mask"]
+    assert mask.any() and not mask.all()
+    loss = make_loss("whole", model)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    out = loss(batch)
+    total(out).backward()
+    optimizer.step()
+    assert all(parameter.isfinite().all() for parameter in model.parameters())
+    assert all(value.isfinite() for value in out.values())
+    assert model.policy.output.weight.grad.any()
+    reference = loss.eval()(batch)
+    junk = batch.clone()
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward"), ("plan", "loc")):
+        junk[key][~mask] = 1e4
+    torch.manual_seed(0)
+    expected = loss(batch)
+    torch.manual_seed(0)
+    assert torch.equal(loss(junk)["loss_policy"], expected["loss_policy"])
+    assert reference["policy_kl"].isfinite()

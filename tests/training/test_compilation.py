@@ -162,7 +162,8 @@ def test_a_compiled_update_equals_an_eager_one(warmed, tiny_config):
         applied = []
 
         def record(optimizer, *_, applied=applied):
-            applied += [flat.grad.clone() for group in optimizer.param_groups for flat in group["params"]]
+            flats = [flat for group in optimizer.param_groups for flat in group["params"]]
+            applied += [flat.grad.clone() for flat in flats if flat.grad is not None]
 
         hook = updater.optimizer.register_step_pre_hook(record)
         torch.manual_seed(1)

@@ -6,24 +6,31 @@ import torch
 from torch import Tensor
 
 
-def updated_scale(scale: Tensor, batch: Tensor, tau: float) -> Tensor:
-    """Moves a running scale towards the spread between a batch's 5th and 95th percentile, never below 1.
+def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | None = None) -> Tensor:
+    """Moves a running scale towards the spread between a batch's 5th and 95th percentile, or towards 1 if that is less.
 
-    ``S <- max((1 - tau) S + tau (p95 - p5), 1)`` (TD-MPC2, arXiv:2310.16828; BMPC applies it to the KL).
+    ``S <- (1 - tau) S + tau max(p95 - p5, 1)`` (TD-MPC2, arXiv:2310.16828; BMPC applies it to the KL).
 
     Args:
-        scale (Tensor): the present scale, a scalar.
+        scale (Tensor): the present scale, a scalar, at least 1.
         batch (Tensor): values of one batch, any shape.
         tau (float): rate of the exponential moving average, in [0, 1].
+        counts (Tensor, optional): which values count, bool, the batch's shape. Default: all of them.
 
     Returns:
-        Tensor: the new scale, a scalar without gradient. A batch whose spread is not finite leaves it where it is.
+        Tensor: the new scale, a scalar without gradient. A batch whose spread is not finite, or in which nothing
+        counts, leaves it where it is.
 
     >>> updated_scale(torch.tensor(1.0), torch.linspace(0, 100, 101), tau=1.0).item()
     90.0
     """
-    quantiles = torch.quantile(
-        batch.detach().flatten(), torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device)
-    )
-    spread = (quantiles[1] - quantiles[0]).to(scale.dtype)
-    return torch.lerp(scale, torch.where(spread.isfinite(), spread, scale), tau).clamp_min(1.0)
+    batch = batch.detach().flatten()
+    levels = torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device)
+    if counts is None:
+        quantiles = torch.quantile(batch, levels)
+    else:
+        # What does not count becomes NaN, which nanquantile leaves out; a NaN that counts must not be left out.
+        finite = (batch.isfinite() | ~counts.flatten()).all()
+        quantiles = torch.nanquantile(torch.where(counts.flatten() & finite, batch, torch.nan), levels)
+    spread = (quantiles[1] - quantiles[0]).to(scale.dtype).clamp_min(1.0)
+    return torch.lerp(scale, torch.where(spread.isfinite(), spread, scale), tau)

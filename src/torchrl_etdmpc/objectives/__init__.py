@@ -1,15 +1,9 @@
 """Losses: TorchRL loss modules and the formulas behind them."""
 
 from torchrl_etdmpc.objectives.efficient_tdmpc import EfficientTDMPCLoss
-from torchrl_etdmpc.objectives.latent_rollout import (
-    ExtraTerm,
-    LatentRollout,
-    Reduction,
-    Slices,
-    TermFunction,
-    latent_rollout,
-)
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, latent_rollout
 from torchrl_etdmpc.objectives.policy import EfficientTDMPCPolicyLoss, KLDirection, distillation
+from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term, TermFunction
 from torchrl_etdmpc.objectives.value import EfficientTDMPCValueLoss, imagined_value_target, value_error
 from torchrl_etdmpc.objectives.world_model import (
     EfficientTDMPCModelLoss,
@@ -23,11 +17,12 @@ __all__ = [
     "EfficientTDMPCModelLoss",
     "EfficientTDMPCPolicyLoss",
     "EfficientTDMPCValueLoss",
-    "ExtraTerm",
     "KLDirection",
     "LatentRollout",
+    "LatentRolloutLoss",
     "Reduction",
     "Slices",
+    "Term",
     "TermFunction",
     "consistency_error",
     "distillation",

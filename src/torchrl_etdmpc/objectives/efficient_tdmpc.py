@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from torch import Tensor
+from collections.abc import Sequence
 
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import (
-    ExtraTerm,
-    KLDirection,
-    LatentRollout,
-    LatentRolloutLoss,
-    Reduction,
-    Slices,
-)
-from torchrl_etdmpc.objectives.policy import policy_terms, register_running_scale
-from torchrl_etdmpc.objectives.value import register_discount, value_terms
+from torchrl_etdmpc.objectives.policy import policy_term, register_running_scale
+from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.value import value_term
 from torchrl_etdmpc.objectives.world_model import model_terms
 
 
@@ -45,15 +36,15 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         distill (bool): whether to compute the policy term. The attribute can be changed later: pretraining on random
             data turns it off. Default: ``True``.
-        extra_terms (mapping of str to ExtraTerm, optional): terms of one's own, weighted by ``rho^k`` like the others;
-            ``name`` adds ``loss_name``, the metric ``name_error`` and the buffer ``name_coef``.
+        extra_terms (sequence of Term): terms of one's own, see :class:`Term`. Default: none.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
             error; on CUDA, where looking would wait for the device, nothing is checked. Default: ``False``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or a name of a term is taken.
+        TypeError: if an extra term is not a :class:`Term`.
 
     >>> from torchrl.objectives import SoftUpdate
     >>> from torchrl_etdmpc.testing import random_slices
@@ -63,18 +54,6 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
     >>> sorted(key for key in out.keys() if key.startswith("loss_"))
     ['loss_consistency', 'loss_policy', 'loss_reward', 'loss_value']
     """
-
-    _schedulable_buffers = frozenset(
-        {
-            "consistency_coef",
-            "reward_coef",
-            "value_coef",
-            "termination_coef",
-            "policy_coef",
-            "entropy_coef",
-            "discount",
-        }
-    )
 
     def __init__(
         self,
@@ -91,27 +70,27 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         kl_direction: KLDirection = "backward",
         rho: float = 0.5,
         distill: bool = True,
-        extra_terms: Mapping[str, ExtraTerm] | None = None,
+        extra_terms: Sequence[Term] = (),
         ignore_termination: bool = False,
         reduction: Reduction | None = None,
     ) -> None:
         super().__init__(
             world_model,
-            networks=("encoder", "dynamics", "reward", "value", "termination", "policy"),
-            coefficients={
-                "consistency": consistency_coef,
-                "reward": reward_coef,
-                "value": value_coef,
-                "policy": policy_coef,
-                "entropy": entropy_coef,
-                **({} if world_model.termination_head is None else {"termination": termination_coef}),
-            },
-            rho=rho,
-            reduction=reduction,
-            ignore_termination=ignore_termination,
+            [
+                *model_terms(
+                    world_model,
+                    consistency_coef=consistency_coef,
+                    reward_coef=reward_coef,
+                    termination_coef=termination_coef,
+                ),
+                value_term(self, value_coef=value_coef, discount=discount),
+                policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),
+            ],
             extra_terms=extra_terms,
+            rho=rho,
+            ignore_termination=ignore_termination,
+            reduction=reduction,
         )
-        register_discount(self, discount)
         register_running_scale(self, scale_tau, kl_direction)
         self.distill = distill
 
@@ -131,30 +110,6 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         self._in_keys = None
 
     @property
-    def _reads(self) -> tuple[str, ...]:
-        flags = () if self.world_model.termination_head is None else ("terminated",)
-        plan = ("plan_loc", "plan_scale") if self.distill else ()
-        return ("observation", "next_observation", "action", "reward", *flags, *plan)
-
-    @property
-    def _term_names(self) -> tuple[str, ...]:
-        flags = () if self.world_model.termination_head is None else ("termination",)
-        return ("consistency", "reward", *flags, "value", *(("policy",) if self.distill else ()))
-
-    @property
-    def _metric_names(self) -> tuple[str, ...]:
-        flags = () if self.world_model.termination_head is None else ("termination_error",)
-        policy = ("policy_kl", "policy_entropy", "kl_scale") if self.distill else ()
-        return ("consistency_error", "reward_error", *flags, "value_error", "value_target", *policy)
-
-    def _terms(
-        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        parts = [model_terms(self, slices, rollout), value_terms(self, slices, rollout, target_values)]
-        if self.distill:
-            parts.append(policy_terms(self, slices, rollout))
-        terms, metrics = {}, {}
-        for part_terms, part_metrics in parts:
-            terms.update(part_terms)
-            metrics.update(part_metrics)
-        return terms, metrics
+    def active_terms(self) -> tuple[Term, ...]:
+        """The terms that :meth:`forward` evaluates; that of the policy only while :attr:`distill` is on."""
+        return self.terms if self._distill else tuple(term for term in self.terms if term.name != "policy")

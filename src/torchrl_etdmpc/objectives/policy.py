@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple, get_args
 
 import torch
@@ -9,15 +10,8 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import (
-    KLDirection,
-    LatentRollout,
-    LatentRolloutLoss,
-    Reduction,
-    Slices,
-    head_rows,
-    mean_of_head_rows,
-)
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term
 
 
 class Distillation(NamedTuple):
@@ -64,8 +58,8 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
     """Distils the planner into the policy (thesis Eq. 2.17; BMPC, arXiv:2503.18871).
 
     On the detached rollout latents, ``KL(pi || plan) / S - entropy_coef * entropy * A`` with the KL averaged over
-    action dimensions; S is a running scale of the KL (5th to 95th percentile at k = 0, never below 1), moved only in
-    training mode. Trains the policy alone.
+    action dimensions; S is a running scale of the KL (5th to 95th percentile at k = 0, at least 1), moved only
+    in training mode. Trains the policy alone.
 
     Args:
         world_model (WorldModel): the networks, shared with the caller.
@@ -87,8 +81,6 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
     ['kl_scale', 'loss_policy', 'policy_entropy', 'policy_kl']
     """
 
-    _schedulable_buffers = frozenset({"entropy_coef", "policy_coef"})
-
     def __init__(
         self,
         world_model: WorldModel,
@@ -100,31 +92,9 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
         rho: float = 0.5,
         reduction: Reduction | None = None,
     ) -> None:
-        super().__init__(
-            world_model,
-            networks=("policy",),
-            coefficients={"policy": policy_coef, "entropy": entropy_coef},
-            rho=rho,
-            reduction=reduction,
-        )
+        term = policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef)
+        super().__init__(world_model, [term], rho=rho, reduction=reduction)
         register_running_scale(self, scale_tau, kl_direction)
-
-    @property
-    def _reads(self) -> tuple[str, ...]:
-        return ("observation", "next_observation", "action", "plan_loc", "plan_scale")
-
-    @property
-    def _term_names(self) -> tuple[str, ...]:
-        return ("policy",)
-
-    @property
-    def _metric_names(self) -> tuple[str, ...]:
-        return ("policy_kl", "policy_entropy", "kl_scale")
-
-    def _terms(
-        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        return policy_terms(self, slices, rollout)
 
 
 def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_direction: KLDirection) -> None:
@@ -138,20 +108,36 @@ def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_directi
     loss.register_buffer("kl_scale", torch.ones(()))
 
 
-def policy_terms(
-    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Term ``[T, B]`` and metrics of the policy, for any loss with a running scale."""
+def policy_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float) -> Term:
+    """The term of the policy, for any loss with a running scale."""
+    return Term(
+        "policy",
+        partial(_policy, loss),
+        policy_coef,
+        networks=("policy",),
+        keys=("plan_loc", "plan_scale"),
+        metrics=("policy_kl", "policy_entropy", "kl_scale"),
+        scalars={"entropy_coef": entropy_coef},
+    )
+
+
+def _policy(
+    loss: LatentRolloutLoss,
+    world_model: WorldModel,
+    slices: Slices,
+    rollout: LatentRollout,
+) -> tuple[Tensor, dict[str, Tensor]]:
     assert slices.plan_loc is not None and slices.plan_scale is not None
-    heads = loss.world_model.num_dynamics
+    heads = world_model.num_dynamics
     latent = head_rows(rollout.predicted[:-1])
     plan = head_rows(slices.plan_loc, heads), head_rows(slices.plan_scale, heads)
-    kl, entropy = distillation(loss.world_model, latent, *plan, kl_direction=loss.kl_direction)
+    kl, entropy = distillation(world_model, latent, *plan, kl_direction=loss.kl_direction)
+    first = None if slices.counts is None else slices.counts[0]
     # Departure from BMPC, which moves the scale in every policy step: an evaluation of the loss must not change it.
     if loss.training:
-        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau))
+        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau, first))
     scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
-    term = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
-    policy_kl, policy_entropy = (mean_of_head_rows(value, heads).mean() for value in (kl, entropy))
+    error = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
+    policy_kl, policy_entropy = (mean_of_head_rows(value, heads) for value in (kl, entropy))
     metrics = {"policy_kl": policy_kl, "policy_entropy": policy_entropy, "kl_scale": scale}
-    return {"policy": loss._discount_depth(mean_of_head_rows(term, heads))}, metrics
+    return mean_of_head_rows(error, heads), metrics

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,14 +12,8 @@ from torch.func import functional_call
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import (
-    LatentRollout,
-    LatentRolloutLoss,
-    Reduction,
-    Slices,
-    head_rows,
-    mean_of_head_rows,
-)
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term
 
 
 @torch.no_grad()
@@ -99,8 +95,6 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
     ['loss_value', 'value_error', 'value_target']
     """
 
-    _schedulable_buffers = frozenset({"value_coef", "discount"})
-
     def __init__(
         self,
         world_model: WorldModel,
@@ -113,53 +107,43 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
     ) -> None:
         super().__init__(
             world_model,
-            networks=("encoder", "dynamics", "value"),
-            coefficients={"value": value_coef},
+            [value_term(self, value_coef=value_coef, discount=discount)],
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,
         )
-        register_discount(self, discount)
-
-    @property
-    def _reads(self) -> tuple[str, ...]:
-        return ("observation", "next_observation", "action")
-
-    @property
-    def _term_names(self) -> tuple[str, ...]:
-        return ("value",)
-
-    @property
-    def _metric_names(self) -> tuple[str, ...]:
-        return ("value_error", "value_target")
-
-    def _terms(
-        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        return value_terms(self, slices, rollout, target_values)
 
 
-def register_discount(loss: LatentRolloutLoss, discount: float) -> None:
-    """Checks the discount and registers it as a buffer of the loss."""
+def value_term(loss: LatentRolloutLoss, *, value_coef: float, discount: float) -> Term:
+    """The term of the value heads, for any loss.
+
+    Raises:
+        ValueError: if the discount is out of range.
+    """
     if not 0 < discount <= 1:
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
-    loss.register_coeff_buffer("discount", float(discount))
+    return Term(
+        "value",
+        partial(_value, loss),
+        value_coef,
+        networks=("encoder", "dynamics", "value"),
+        targets=("value",),
+        metrics=("value_error", "value_target"),
+        scalars={"discount": discount},
+    )
 
 
-def value_terms(
-    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Term ``[T, B]`` and metrics of the value heads, for any loss that owns target value parameters."""
-    assert target_values is not None  # a loss that trains the value heads has targets of them
-    world_model = loss.world_model
+def _value(
+    loss: LatentRolloutLoss, world_model: WorldModel, slices: Slices, rollout: LatentRollout
+) -> tuple[Tensor, dict[str, Tensor]]:
+    targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
 
     def values(latent: Tensor) -> Tensor:
-        logits = functional_call(loss.value, target_values, (latent,))
+        logits = functional_call(loss.value, targets["value"], (latent,))
         return two_hot_decode(logits, world_model.bins).movedim(0, -1)
 
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
     target = imagined_value_target(
         world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
     )
-    error = value_error(world_model, rollout, target, dropout=loss.training)
-    return {"value": loss._discount_depth(error)}, {"value_error": error.mean(), "value_target": target.mean()}
+    return value_error(world_model, rollout, target, dropout=loss.training), {"value_target": target}

@@ -7,14 +7,8 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import (
-    LatentRollout,
-    LatentRolloutLoss,
-    Reduction,
-    Slices,
-    head_rows,
-    mean_of_head_rows,
-)
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term
 
 
 def consistency_error(rollout: LatentRollout) -> Tensor:
@@ -97,8 +91,6 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
     ['consistency_error', 'loss_consistency', 'loss_reward', 'reward_error']
     """
 
-    _schedulable_buffers = frozenset({"consistency_coef", "reward_coef", "termination_coef"})
-
     def __init__(
         self,
         world_model: WorldModel,
@@ -112,47 +104,50 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
     ) -> None:
         super().__init__(
             world_model,
-            networks=("encoder", "dynamics", "reward", "termination"),
-            coefficients={
-                "consistency": consistency_coef,
-                "reward": reward_coef,
-                **({} if world_model.termination_head is None else {"termination": termination_coef}),
-            },
+            model_terms(
+                world_model,
+                consistency_coef=consistency_coef,
+                reward_coef=reward_coef,
+                termination_coef=termination_coef,
+            ),
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,
         )
 
-    @property
-    def _reads(self) -> tuple[str, ...]:
-        flags = () if self.world_model.termination_head is None else ("terminated",)
-        return ("observation", "next_observation", "action", "reward", *flags)
-
-    @property
-    def _term_names(self) -> tuple[str, ...]:
-        return ("consistency", "reward", *(() if self.world_model.termination_head is None else ("termination",)))
-
-    @property
-    def _metric_names(self) -> tuple[str, ...]:
-        return tuple(f"{name}_error" for name in self._term_names)
-
-    def _terms(
-        self, slices: Slices, rollout: LatentRollout, target_values: dict[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        return model_terms(self, slices, rollout)
-
 
 def model_terms(
-    loss: LatentRolloutLoss, slices: Slices, rollout: LatentRollout
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Terms ``[T, B]`` and metrics of the world model, for any loss on a latent rollout."""
-    errors = {
-        "consistency": consistency_error(rollout),
-        "reward": reward_error(loss.world_model, rollout, slices),
-    }
-    terms = {name: loss._discount_depth(error) for name, error in errors.items()}
-    # Departure from the thesis, which states no weight: not decayed with rho, because a terminal state is always the
-    # last of its slice and a decay would bias the probability.
-    if loss.world_model.termination_head is not None:
-        terms["termination"] = errors["termination"] = termination_error(loss.world_model, rollout, slices)
-    return terms, {f"{name}_error": error.mean() for name, error in errors.items()}
+    world_model: WorldModel, *, consistency_coef: float, reward_coef: float, termination_coef: float
+) -> list[Term]:
+    """The terms of the world model; that of the termination only where it has a head for it."""
+    rolled = ("encoder", "dynamics")
+    terms = [
+        Term("consistency", _consistency, consistency_coef, networks=rolled),
+        Term("reward", _reward, reward_coef, networks=(*rolled, "reward"), keys=("reward",)),
+    ]
+    if world_model.termination_head is not None:
+        # Departure from the thesis, which states no weight: not decayed with rho, because a terminal state is always
+        # the last of its slice and a decay would bias the probability.
+        terms.append(
+            Term(
+                "termination",
+                _termination,
+                termination_coef,
+                networks=(*rolled, "termination"),
+                keys=("terminated",),
+                decayed=False,
+            )
+        )
+    return terms
+
+
+def _consistency(world_model: WorldModel, slices: Slices, rollout: LatentRollout) -> Tensor:
+    return consistency_error(rollout)
+
+
+def _reward(world_model: WorldModel, slices: Slices, rollout: LatentRollout) -> Tensor:
+    return reward_error(world_model, rollout, slices)
+
+
+def _termination(world_model: WorldModel, slices: Slices, rollout: LatentRollout) -> Tensor:
+    return termination_error(world_model, rollout, slices)

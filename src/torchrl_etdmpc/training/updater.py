@@ -13,6 +13,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Slices
 from torchrl_etdmpc.training.compilation import compile_call, tracing_gradients
 
+_CLIPPED_TOGETHER = {"model": ("encoder", "heads", "values"), "policy": ("policy",)}
 _ALIGNMENT = 16  # elements: every parameter begins at a multiple of 64 bytes, as memory of its own would
 
 
@@ -23,8 +24,11 @@ class Updater:
     the summed loss is the model step followed by the policy step on the detached latents. The gradients of the two are
     clipped separately; Adam with ``eps=1e-5`` serves the policy (TD-MPC2).
 
-    An update whose gradient is not finite is skipped: weights and optimiser stay as they are, and ``skipped`` and
-    ``skipped_in_a_row`` count it, on the device.
+    Where the model's gradient is not finite the update is skipped: weights and optimiser stay as they are. Where only
+    the policy's is not, the policy alone stays. ``skipped`` and ``skipped_in_a_row`` count both, on the device.
+
+    Every parameter of the loss is trained, also those that a term of the user's own brings; these are clipped with the
+    model's. A frozen parameter (``requires_grad_(False)``) stays as it is.
 
     The weights of each part move into one piece of memory, of which the parameters become views, so that clipping, Adam
     and the target average are a few operations whatever the number of layers. Parameters that get new memory afterwards
@@ -42,7 +46,7 @@ class Updater:
             eager. An update without distillation is always eager: pretraining is short.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or parameters differ in dtype or device.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.testing import random_slices
@@ -72,16 +76,10 @@ class Updater:
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
         SoftUpdate(loss, tau=tau)  # tells the loss that its targets follow
+        self.parts = _parts(loss)
+        self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         values = dict(loss.value_params.flatten_keys(".").items())
         targets = dict(loss.target_value_params.flatten_keys(".").items())
-        heads = [name for name in ("dynamics", "reward", "termination") if f"{name}_params" in loss._modules]
-        self.parts: dict[str, list[nn.Parameter]] = {
-            "encoder": list(loss.encoder_params.parameters()),
-            "heads": [p for name in heads for p in getattr(loss, f"{name}_params").parameters()],
-            "values": list(values.values()),
-            "policy": list(loss.policy_params.parameters()),
-        }
-        self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         self._flat_targets = _moved_together([targets[name] for name in values])
         self._views = [p for tensors in self.parts.values() for p in tensors]
         self._addresses = [p.data_ptr() for p in self._views]
@@ -109,7 +107,7 @@ class Updater:
         """One update.
 
         Args:
-            batch (TensorDictBase): slices, batch size [B, T]; priorities and masks are not read.
+            batch (TensorDictBase): slices, batch size [B, T].
             distill (bool): whether to train the policy (pretraining does not).
 
         Returns:
@@ -122,21 +120,23 @@ class Updater:
             raise RuntimeError("the loss's parameters have been moved; make a new Updater for this loss.")
         if self.loss.distill != distill:
             self.loss.distill = distill
-        inputs = self.loss.slices(batch), self.loss.target_values()
+        inputs = self.loss.slices(batch), self.loss.targets()
         if self._compiled is None or not distill:
             metrics, gradients, skip = self._gradients(*inputs)
         else:
             with tracing_gradients():
                 metrics, gradients, skip = self._compiled(*inputs)
-        for part, gradient in gradients.items():
-            self._flat[part].grad = gradient
-        # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
-        self.optimizer.grad_scale = None  # pyright: ignore[reportAttributeAccessIssue]
-        self.optimizer.found_inf = skip  # pyright: ignore[reportAttributeAccessIssue]
-        self.optimizer.step()
-        self.optimizer.zero_grad()
-        self.skipped += skip.long()
-        self.skipped_in_a_row.add_(1).mul_(skip.long())
+        for name, not_finite in skip.items():
+            for part in _CLIPPED_TOGETHER[name]:
+                self._flat[part].grad = gradients[part]
+            # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
+            self.optimizer.grad_scale = None  # pyright: ignore[reportAttributeAccessIssue]
+            self.optimizer.found_inf = not_finite  # pyright: ignore[reportAttributeAccessIssue]
+            self.optimizer.step()
+            self.optimizer.zero_grad()
+        skipped = torch.stack(list(skip.values())).amax().long()
+        self.skipped += skipped
+        self.skipped_in_a_row.add_(1).mul_(skipped)
         self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
         self.loss.world_model.version += 1
         return TensorDict(metrics, batch_size=[]).clone()
@@ -153,7 +153,7 @@ class Updater:
         self.loss.distill = True
         try:
             with tracing_gradients():
-                self._compiled(self.loss.slices(batch), self.loss.target_values())
+                self._compiled(self.loss.slices(batch), self.loss.targets())
         finally:
             self.loss.kl_scale.copy_(scale)
             self.loss.distill = distill
@@ -163,30 +163,41 @@ class Updater:
         self._compiled = None
 
     def _gradients(
-        self, slices: Slices, target_values: dict[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-        """Losses and metrics, the clipped gradient of the summed losses in the layout of each part, and 1.0 to skip.
+        self, slices: Slices, targets: dict[str, dict[str, Tensor]]
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
+        """Losses and metrics, clipped gradients of the sum in the layout of each part, and 1.0 for what to skip.
 
         All of it is one graph when it is compiled, so nothing here may wait for the device or depend on a value.
         """
         # Departure from BMPC and TD-MPC2, which make two backward passes, the model's and then the policy's: neither
         # loss sends a gradient into what the other one trains, so the gradient of the sum is both.
-        out = self.loss.evaluate(slices, target_values)
+        out = self.loss.evaluate(slices, targets)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
-        clipped = {"model": ("encoder", "heads", "values")} | ({"policy": ("policy",)} if self.loss.distill else {})
+        clipped = {name: parts for name, parts in _CLIPPED_TOGETHER.items() if self.loss.distill or name != "policy"}
         gradients = self._flat_gradients(total, [part for names in clipped.values() for part in names])
         for name, names in clipped.items():
             norm = torch.stack([gradients[part].norm() for part in names]).norm()
             factor = (self.grad_clip_norm / (norm + 1e-6)).clamp(max=1)  # as torch.nn.utils.clip_grad_norm_
             gradients.update({part: factor * gradients[part] for part in names})
             metrics[f"grad_norm_{name}"] = norm
-        norms = torch.stack([metrics[f"grad_norm_{name}"] for name in clipped])
-        return metrics, gradients, norms.isfinite().all().logical_not().float()
+        skip = {name: metrics[f"grad_norm_{name}"].isfinite().logical_not().float() for name in clipped}
+        if "policy" in skip:
+            skip["policy"] = torch.maximum(skip["policy"], skip["model"])
+        return metrics, gradients, skip
 
     def _flat_gradients(self, total: Tensor, parts: list[str]) -> dict[str, Tensor]:
         """The gradient of each part, in the layout of its piece of memory."""
-        every = iter(torch.autograd.grad(total, [p for part in parts for p in self.parts[part]]))
+        parameters = [p for part in parts for p in self.parts[part]]
+        found = torch.autograd.grad(total, parameters, allow_unused=True)
+        if any(gradient is None for gradient in found):
+            names = {id(parameter): name for name, parameter in self.loss.named_parameters()}
+            unread = [names[id(p)] for p, gradient in zip(parameters, found, strict=True) if gradient is None]
+            raise RuntimeError(
+                f"no term sends a gradient into {', '.join(unread)}; freeze what is not to be trained with "
+                "requires_grad_(False) before making the Updater."
+            )
+        every = iter(found)
         return {part: _joined([next(every) for _ in self.parts[part]]) for part in parts}
 
     def state_dict(self) -> dict[str, Any]:
@@ -199,6 +210,23 @@ class Updater:
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
+
+
+def _parts(loss: EfficientTDMPCLoss) -> dict[str, list[nn.Parameter]]:
+    """The parameters by how they are trained: what has no rule of its own is trained as the heads are."""
+    parts: dict[str, list[nn.Parameter]] = {"encoder": [], "heads": [], "values": [], "policy": []}
+    first = next(loss.parameters())
+    for network, parameters in loss.network_parameters().items():
+        part = {"encoder": "encoder", "value": "values", "policy": "policy"}.get(network, "heads")
+        for parameter in parameters:
+            if (parameter.dtype, parameter.device) != (first.dtype, first.device):
+                raise ValueError(
+                    f"all parameters of the loss must be {first.dtype} on {first.device} as its first one, got "
+                    f"{parameter.dtype} on {parameter.device} in {network!r}; move the loss as a whole: loss.to(...)."
+                )
+            if parameter.requires_grad:
+                parts[part].append(parameter)
+    return parts
 
 
 def _joined(tensors: Sequence[Tensor]) -> Tensor:

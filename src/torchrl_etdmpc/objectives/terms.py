@@ -1,0 +1,509 @@
+"""Losses made of terms: what a term names, and the loss that evaluates a list of them on one latent rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, get_args
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, counted_mean, latent_rollout
+from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
+
+Reduction = Literal["none", "mean", "sum"]
+KLDirection = Literal["backward", "forward"]
+TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tensor, dict[str, Tensor]]]
+
+_ROLLOUT_FIELDS = ("observation", "next_observation", "action")
+_FIELDS = (*_ROLLOUT_FIELDS, "reward", "terminated", "plan_loc", "plan_scale")
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One term of a loss: an error of every step of every slice, and what it needs.
+
+    A function that is an ``nn.Module`` brings networks of its own: the loss owns, saves, moves and trains them. The
+    gradient goes wherever the function lets it; it detaches what it must not train.
+
+    Attributes:
+        name (str): gives the names of the entry ``loss_<name>`` and of the coefficient ``<name>_coef``.
+        function (callable): world model, :class:`Slices` and :class:`LatentRollout` to an error ``[T, B]``, or to the
+            error and a dictionary of metrics (``[T, B]``, of which the loss takes the mean, or scalars).
+        coef (float): weight of the term.
+        networks (tuple of str): networks of the world model that the loss trains because of it.
+        targets (tuple of str): those of them of which it reads a slowly following copy, ``rollout.targets[name]``.
+        keys (tuple of NestedKey): what it reads beside observations and actions: names of fields of :class:`Slices`
+            (``"reward"``, ``"terminated"``, ``"plan_loc"``, ``"plan_scale"``), or keys of the batch, which it finds in
+            ``slices.extra``.
+        metrics (tuple of str, optional): the metrics that it reports; ``<name>_error``, the mean error, is the loss's
+            to fill in. Default: that one alone.
+        scalars (mapping of str to float): further numbers, which become buffers of the loss.
+        decayed (bool): whether step k is weighted by ``rho^k``.
+
+    >>> from torchrl.objectives import SoftUpdate
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> def small_actions(world_model, slices, rollout):
+    ...     mean, _ = world_model.policy(rollout.predicted[:-1].detach())  # [T, F, B, A]
+    ...     return mean.square().mean((1, -1))
+    >>> model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> loss = EfficientTDMPCLoss(model, discount=0.99, extra_terms=[Term("small_actions", small_actions, coef=0.1)])
+    >>> updater = SoftUpdate(loss, tau=0.01)
+    >>> "loss_small_actions" in loss(random_slices(3, 2))
+    True
+    """
+
+    name: str
+    function: TermFunction
+    coef: float = 1.0
+    networks: tuple[str, ...] = ()
+    targets: tuple[str, ...] = ()
+    keys: tuple[NestedKey, ...] = ()
+    metrics: tuple[str, ...] | None = None
+    scalars: Mapping[str, float] = field(default_factory=dict)
+    decayed: bool = True
+
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """Names of the metrics that the loss returns for this term."""
+        return (f"{self.name}_error",) if self.metrics is None else self.metrics
+
+    def evaluate(
+        self, world_model: WorldModel, slices: Slices, rollout: LatentRollout
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Error ``[T, B]`` and metrics.
+
+        Raises:
+            ValueError: if the shape of the error or the names of the metrics are others than stated.
+        """
+        result = self.function(world_model, slices, rollout)
+        error, metrics = result if isinstance(result, tuple) else (result, {})
+        if error.shape != slices.action.shape[:2]:
+            raise ValueError(
+                f"the term {self.name!r} must return an error of shape [T, B]={list(slices.action.shape[:2])}, got "
+                f"{list(error.shape)}."
+            )
+        if f"{self.name}_error" in self.metric_names:
+            metrics = {f"{self.name}_error": error, **metrics}
+        if metrics.keys() != set(self.metric_names):
+            raise ValueError(
+                f"the term {self.name!r} must return the metrics {sorted(self.metric_names)}, got {sorted(metrics)}; "
+                "name them in Term(metrics=...)."
+            )
+        return error, metrics
+
+
+def _reduced(term: Tensor, counts: Tensor | None, reduction: Reduction) -> Tensor:
+    """A term ``[T, B]`` to a scalar, or to ``[B, T]`` without reduction; steps that do not count are zeros."""
+    if reduction == "mean":
+        return counted_mean(term, counts)
+    if counts is not None:
+        term = torch.where(counts, term, 0)
+    return term.sum() if reduction == "sum" else term.transpose(0, 1)
+
+
+class LatentRolloutLoss(LossModule):
+    """A loss made of terms, which trains a :class:`~torchrl_etdmpc.modules.WorldModel` on replayed slices.
+
+    What it trains, reads and returns follows from its terms. Every term is weighted once, by the coefficient buffer
+    ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are. A coefficient is assigned like a number
+    (``loss.reward_coef = 0.3``), in place.
+
+    Networks stay shared with the world model that was passed: the planner that holds it sees every update. Every step
+    of a PyTorch optimiser that trains them counts as one in ``world_model.version``, which dates the planner's targets
+    and is part of this loss' state.
+
+    Padded steps count for nothing: not in losses, gradients, running scale or metrics. The mask is found as TorchRL's
+    losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
+    ``"shifted_valid"``, where the batch has them; or at the key ``loss.loss_mask_key``. A step counts if no step of its
+    slice up to it is masked, since the rollout goes through all of them; means divide by the number of those.
+
+    Args:
+        world_model (WorldModel): the networks, shared with the caller.
+        terms (sequence of Term): in the order in which they are evaluated.
+
+    Keyword Args:
+        extra_terms (sequence of Term): terms of the user's own, after the others.
+        rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
+        ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
+            head. Default: ``True``.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
+
+    Raises:
+        TypeError: if a term is not a :class:`Term`.
+        ValueError: if an argument is out of range, or two names of terms, coefficients or metrics are the same.
+    """
+
+    # TorchRL sums every entry that starts with "loss_" (its Trainer does, and so do users), so the entries must carry
+    # their weight; the unweighted values are the metrics that end in "_error" or "_kl".
+
+    @dataclass
+    class _AcceptedKeys:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Configurable tensordict keys.
+
+        Attributes:
+            observation (NestedKey): flat observation ``[B, T, O]``; its successor is read at ``("next", observation)``.
+            action (NestedKey): replayed action ``[B, T, A]`` in [-1, 1].
+            reward (NestedKey): read at ``("next", reward)``, ``[B, T, 1]``.
+            terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head;
+                without one it is looked at only to refuse termination.
+            plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
+            plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``.
+        """
+
+        observation: NestedKey = OBSERVATION
+        action: NestedKey = ACTION
+        reward: NestedKey = REWARD
+        terminated: NestedKey = TERMINATED
+        plan_loc: NestedKey = (PLAN, LOC)
+        plan_scale: NestedKey = (PLAN, SCALE)
+
+    tensor_keys: _AcceptedKeys  # pyright: ignore[reportIncompatibleMethodOverride]
+    default_keys = _AcceptedKeys
+    default_value_estimator = None  # pyright: ignore[reportAssignmentType]
+
+    world_model: WorldModel
+    reduction: Reduction  # pyright: ignore[reportIncompatibleVariableOverride]
+    rho: Tensor
+    # Each loss has what its networks and terms need of the following.
+    encoder: nn.Module
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    dynamics: nn.Module
+    dynamics_params: TensorDictParams
+    target_dynamics_params: TensorDictParams
+    reward: nn.Module
+    reward_params: TensorDictParams
+    target_reward_params: TensorDictParams
+    value: nn.Module
+    value_params: TensorDictParams
+    target_value_params: TensorDictParams
+    termination: nn.Module
+    termination_params: TensorDictParams
+    target_termination_params: TensorDictParams
+    policy: nn.Module
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+    discount: Tensor
+    entropy_coef: Tensor
+    kl_scale: Tensor
+    scale_tau: float
+    kl_direction: KLDirection
+
+    _attributes: ClassVar[dict[str, str]] = {
+        "encoder": "encoder",
+        "dynamics": "dynamics",
+        "reward": "reward_head",
+        "value": "value_head",
+        "termination": "termination_head",
+        "policy": "policy",
+    }
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        terms: Sequence[Term],
+        *,
+        extra_terms: Sequence[Term] = (),
+        rho: float = 0.5,
+        ignore_termination: bool = True,
+        reduction: Reduction | None = None,
+    ) -> None:
+        super().__init__()
+        self._in_keys = None
+        self._out_keys = None
+        self.reduction = "mean" if reduction is None else reduction
+        if self.reduction not in get_args(Reduction):
+            raise ValueError(f"reduction must be one of {', '.join(get_args(Reduction))}, got {reduction!r}.")
+        if not 0 < rho <= 1:
+            raise ValueError(f"rho must be in (0, 1], got {rho}.")
+        _check_terms(terms, extra_terms, taken=self._attributes)
+        vars(self)["world_model"] = world_model
+        self.terms = (*terms, *extra_terms)
+        trained = {name for term in self.terms for name in term.networks}
+        followed = {name for term in self.terms for name in term.targets}
+        for name, attribute in self._attributes.items():
+            if name in trained and getattr(world_model, attribute) is not None:
+                self.convert_to_functional(getattr(world_model, attribute), name, create_target_params=name in followed)
+        self._scalars: frozenset[str] = frozenset()
+        for term in self.terms:
+            numbers = {f"{term.name}_coef": term.coef, **term.scalars}
+            for name, number in numbers.items():
+                self.register_coeff_buffer(name, float(number))
+            self._scalars |= numbers.keys()
+            if isinstance(term.function, nn.Module):
+                self.add_module(term.name, term.function)
+        self.register_buffer("rho", torch.tensor(float(rho)))
+        self.ignore_termination = ignore_termination
+        count_updates(world_model, self.parameters())
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # TorchRL has a list of such buffers for a class; here each loss has those of its terms.
+        if isinstance(value, int | float) and name in vars(self).get("_scalars", ()):
+            self.get_buffer(name).fill_(value)
+        else:
+            super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]  # TorchRL's annotation is too narrow
+
+    def _apply(self, fn, *args, **kwargs):
+        # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
+        super()._apply(fn, *args, **kwargs)
+        self.__dict__["world_model"]._apply(fn)
+        return self
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        self._in_keys = None  # a new name for a key changes what dispatch expects
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        # The entries of <name>_params are the very parameters of the world model's networks, and planner, loss and
+        # updater rely on it. A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__,
+        # where convert_to_functional put them), but tensordict clones its entries: the loss would train weights that
+        # nobody reads. So they are read anew from the networks. The targets are nobody else's and stay as copied.
+        for name in self._attributes:
+            if f"{name}_params" in self._modules:
+                self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
+        count_updates(self.world_model, self.parameters())
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        # The world model is not a submodule, but who restores the weights restores the number of updates in them.
+        destination[f"{prefix}version"] = self.world_model.version.detach()
+
+    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        version = state_dict.get(f"{prefix}version")
+        super()._load_from_state_dict({k: v for k, v in state_dict.items() if k != f"{prefix}version"}, prefix, *args)
+        if version is not None:  # files of before do not have it
+            self.world_model.version.copy_(version)
+            restart_count(self.world_model)
+
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones."""
+        for name in self._attributes:
+            if f"{name}_params" in self._modules:
+                self.__dict__[name].reset_parameters_recursive()
+        for term in self.terms:
+            if isinstance(term.function, nn.Module):
+                _reset(term.function)
+        parameters: dict[str, Any] = self._modules
+        for name, target in parameters.items():
+            if name.startswith("target_"):
+                target.data.update_(parameters[name.removeprefix("target_")].data)
+
+    def network_parameters(self) -> dict[str, list[nn.Parameter]]:
+        """Every parameter of this loss, once, by its network: of the world model, or of a term that brings its own."""
+        found: dict[str, list[nn.Parameter]] = {}
+        for name, parameter in self.named_parameters():  # lists a parameter that is shared once
+            found.setdefault(name.partition(".")[0].removesuffix("_params"), []).append(parameter)
+        return found
+
+    @property
+    def active_terms(self) -> tuple[Term, ...]:
+        """The terms that :meth:`forward` evaluates."""
+        return self.terms
+
+    def _reads(self) -> dict[NestedKey, NestedKey]:
+        """Where each field of the slices is read, and each further key of the terms."""
+        names = dict.fromkeys([*_ROLLOUT_FIELDS, *(key for term in self.active_terms for key in term.keys)])
+        return {name: self._key(name) for name in names}
+
+    def _key(self, name: NestedKey) -> NestedKey:
+        if name not in _FIELDS:
+            return unravel_key(name)
+        key = getattr(self.tensor_keys, name.removeprefix("next_"))
+        return unravel_key((NEXT, key)) if name in ("next_observation", "reward", "terminated") else unravel_key(key)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that ``forward`` reads."""
+        if self._in_keys is None:
+            self._in_keys = list(self._reads().values())
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self._in_keys = keys
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys that ``forward`` returns: the ``loss_*`` terms, then the metrics."""
+        if self._out_keys is None:
+            terms = self.active_terms
+            return [f"loss_{term.name}" for term in terms] + [name for term in terms for name in term.metric_names]
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, keys: list[str]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self._out_keys = keys
+
+    def slices(self, tensordict: TensorDictBase) -> Slices:
+        """The entries that this loss reads, time first.
+
+        Args:
+            tensordict (TensorDictBase): batch size [B, T].
+
+        Raises:
+            ValueError: if an entry is not of shape [B, T, features], or a row of a CPU tensor terminates although the
+                world model has no termination head. Elsewhere that check would wait for the device and is skipped.
+            KeyError: if a key is missing.
+        """
+        reads = self._reads()
+        entries = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
+        counts = self._counted_steps(tensordict, entries["action"].shape[:2])
+        self._refuse_termination(tensordict, counts)
+        for name, entry in entries.items():
+            if counts is not None:
+                # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
+                harmless = torch.ones_like if name == "plan_scale" else torch.zeros_like
+                entry = torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))
+            entries[name] = entry.transpose(0, 1)
+        fields: dict[str, Any] = {name: entries.pop(name, None) for name in _FIELDS}
+        fields["observation"] = fields["observation"][0]
+        for name in ("reward", "terminated"):
+            if fields[name] is not None:
+                fields[name] = fields[name].squeeze(-1)
+        counts = None if counts is None else counts.transpose(0, 1)
+        return Slices(**fields, counts=counts, extra=entries or None)
+
+    def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            rename = f"loss.set_keys({name.removeprefix('next_')}=...)" if name in _FIELDS else "Term(keys=...)"
+            raise KeyError(
+                f"{type(self).__name__} needs the key {key!r} in its input; rename it with {rename} or store it in the "
+                "replay buffer."
+            )
+        # The batch size is no guide: dispatch infers a longer one where all entries agree in size.
+        if value.ndim != 3 if name in _FIELDS else value.ndim < 2:
+            raise ValueError(
+                f"{type(self).__name__} needs a batch of slices [B, T] and entries of shape [B, T, features], got "
+                f"{key!r} of shape {list(value.shape)}; reshape a flat replay sample with "
+                "sample.reshape(-1, slice_len)."
+            )
+        return value
+
+    def _counted_steps(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
+        """The steps up to which nothing in their slice is masked, bool ``[B, T]``; ``None`` without a mask."""
+        counts = None
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, None)
+            if mask is None:
+                continue
+            if mask.numel() != shape.numel() or mask.shape[:2] != shape:
+                raise ValueError(
+                    f"the mask {key!r} must have the shape [B, T]={list(shape)}, got {list(mask.shape)}; set "
+                    "loss.loss_mask_key to the key of another mask, or to None for no mask."
+                )
+            mask = mask.reshape(shape).bool()
+            counts = mask if counts is None else counts & mask
+        return None if counts is None else counts.int().cumprod(1) > 0
+
+    def _refuse_termination(self, tensordict: TensorDictBase, counts: Tensor | None) -> None:
+        if self.ignore_termination or self.world_model.termination_head is not None or torch.compiler.is_compiling():
+            return
+        terminated = tensordict.get(self._key("terminated"), None)
+        if terminated is None or terminated.device.type != "cpu":
+            return
+        if counts is not None:
+            terminated = terminated.squeeze(-1) & counts
+        if terminated.any():
+            raise ValueError(
+                f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
+                "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
+                f"{type(self).__name__}(..., ignore_termination=True) if that is what you want."
+            )
+
+    @dispatch  # pyright: ignore[reportArgumentType]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the terms on a batch of slices.
+
+        Args:
+            tensordict (TensorDictBase): slices of T consecutive transitions of one episode each, batch size [B, T].
+
+        Returns:
+            TensorDictBase: ``loss_*`` entries (scalars, or ``[B, T]`` with ``reduction="none"``), weighted by their
+            coefficients and by ``rho^k`` at step k, and detached scalar metrics. Means are over the steps that count.
+
+        Raises:
+            ValueError: as :meth:`slices`.
+            KeyError: if a key is missing.
+        """
+        terms = self.evaluate(self.slices(tensordict), self.targets(), self.reduction)
+        out = TensorDict(terms, batch_size=[])
+        self._clear_weakrefs(tensordict, out)
+        return out
+
+    def targets(self) -> dict[str, dict[str, Tensor]]:
+        """The parameters of the target networks, by network and name."""
+        found: dict[str, dict[str, Tensor]] = {}
+        parameters: dict[str, Any] = self._modules
+        for name, target in parameters.items():
+            if name.startswith("target_"):
+                keys = ((key,) if isinstance(key, str) else key for key in target.keys(True, True))
+                network = name.removeprefix("target_").removesuffix("_params")
+                found[network] = {".".join(key): target.get(key).data for key in keys}
+        return found
+
+    def evaluate(
+        self, slices: Slices, targets: Mapping[str, Mapping[str, Tensor]], reduction: Reduction = "mean"
+    ) -> dict[str, Tensor]:
+        """What :meth:`forward` returns, from plain tensors: the part that compiles as one graph.
+
+        Args:
+            slices (Slices): from :meth:`slices`.
+            targets (mapping): from :meth:`targets`.
+            reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
+
+        Returns:
+            dict: ``loss_*`` terms weighted by their coefficients, and detached metrics.
+        """
+        rollout = latent_rollout(self.world_model, slices)._replace(targets=targets)
+        losses, metrics = {}, {}
+        for term in self.active_terms:
+            error, reported = term.evaluate(self.world_model, slices, rollout)
+            weighted = self._discount_depth(error) if term.decayed else error
+            coef = self.get_buffer(f"{term.name}_coef")
+            losses[f"loss_{term.name}"] = coef * _reduced(weighted, slices.counts, reduction)
+            for name in term.metric_names:
+                metric = reported[name]
+                metrics[name] = (counted_mean(metric, slices.counts) if metric.ndim else metric).detach()
+        return losses | metrics
+
+    def _discount_depth(self, error: Tensor) -> Tensor:
+        """Weights ``[T, B]`` errors by ``rho^k``."""
+        powers = self.rho ** torch.arange(error.shape[0], device=error.device, dtype=error.dtype)
+        return error * powers.unsqueeze(-1)
+
+
+def _check_terms(terms: Sequence[Term], extra_terms: Sequence[Term], taken: Iterable[str]) -> None:
+    """Raises where a name of a term, a number or a metric is there twice."""
+    names: set[str] = set(taken)
+    for term in terms:
+        names |= {term.name, f"{term.name}_coef", *term.scalars, *term.metric_names}
+    for term in extra_terms:
+        if not isinstance(term, Term):
+            raise TypeError(f"extra_terms must be a list of Term(name, function, coef), got {term!r} in it.")
+        own, further = [term.name, f"{term.name}_coef"], [*term.scalars, *term.metric_names]
+        if any(name in names or hasattr(LatentRolloutLoss, name) for name in own) or not term.name.isidentifier():
+            raise ValueError(f"extra_terms must have names of their own, got {term.name!r}; choose another one.")
+        for name in further:
+            if name in names or hasattr(LatentRolloutLoss, name):
+                raise ValueError(
+                    f"metrics and scalars must have names of their own, got {name!r} of the term {term.name!r}; choose "
+                    "another one."
+                )
+        new = own + further
+        names.update(new)
+
+
+def _reset(module: nn.Module) -> None:
+    """Draws new weights in every module that can."""
+    for part in module.modules():
+        if hasattr(part, "reset_parameters"):
+            part.reset_parameters()  # pyright: ignore[reportCallIssue]

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import copy
+import gc
+import weakref
+
+import pytest
+import torch
+from torchrl.checkpoint import Checkpoint
+from torchrl.objectives import SoftUpdate
+
+from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss, EfficientTDMPCPolicyLoss
+from torchrl_etdmpc.training import Updater
+
+
+def train(loss, *optimizers, slices, total, steps=3, by_hand=False):
+    for _ in range(steps):
+        total(loss(slices)).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
+        if by_hand:
+            loss.world_model.version += 1
+
+
+def test_every_step_of_an_optimizer_counts_as_one_update(loss, world_model, slices, total):
+    optimizer = torch.optim.Adam(loss.parameters())
+    train(loss, optimizer, slices=slices, total=total)
+    assert world_model.version == 3
+    assert world_model.version.dtype == torch.int64
+
+
+def test_of_the_optimizers_that_share_the_networks_one_counts(make_loss, world_model, slices, total):
+    loss = make_loss("whole", world_model)
+    policy = {id(p) for p in world_model.policy.parameters()}
+    others = [p for p in loss.parameters() if id(p) not in policy]
+    optimizers = [torch.optim.Adam(others), torch.optim.Adam(world_model.policy.parameters())]
+    train(loss, *optimizers, slices=slices, total=total)
+    assert world_model.version == 3
+
+
+def test_losses_that_share_a_world_model_count_a_step_once(make_world_model, slices, total):
+    model = make_world_model()
+    losses = [
+        EfficientTDMPCPolicyLoss(model),
+        EfficientTDMPCModelLoss(model, ignore_termination=True),
+        EfficientTDMPCPolicyLoss(model),
+    ]
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    for _ in range(2):
+        sum(total(loss(slices)) for loss in losses).backward()
+        optimizer.step()
+    assert model.version == 2
+
+
+def test_optimizers_of_other_networks_do_not_count(loss, world_model):
+    other = torch.nn.Linear(2, 2)
+    optimizer = torch.optim.SGD(other.parameters(), lr=0.1)
+    other(torch.ones(2)).sum().backward()
+    optimizer.step()
+    assert world_model.version == 0
+
+
+def test_who_counts_by_hand_as_well_is_one_ahead_and_stays_so(make_loss, world_model, slices, total):
+    loss = make_loss("whole", world_model)
+    optimizer = torch.optim.Adam(loss.parameters())
+    for steps in (1, 5, 20):
+        before = world_model.version.item()
+        train(loss, optimizer, slices=slices, total=total, steps=steps, by_hand=True)
+        assert world_model.version == before + steps + (steps == 1)
+
+
+def test_the_updater_counts_once_too(make_loss, make_world_model, slices):
+    updater = Updater(make_loss("whole", make_world_model()))
+    for number in range(1, 4):
+        updater.step(slices)
+        assert updater.loss.world_model.version == number
+
+
+def test_a_copied_loss_counts_for_its_own_world_model(make_loss, world_model, slices, total):
+    loss = make_loss("whole", world_model)
+    other = copy.deepcopy(loss)
+    train(other, torch.optim.Adam(other.parameters()), slices=slices, total=total)
+    assert (world_model.version, other.world_model.version) == (0, 3)
+
+
+def test_a_cast_loss_goes_on_counting(make_loss, world_model, slices, total):
+    loss = make_loss("whole", world_model).double()
+    train(loss, torch.optim.Adam(loss.parameters()), slices=slices.to(torch.float64), total=total)
+    assert world_model.version == 3
+
+
+def test_a_compiled_step_counts(make_loss, world_model, slices, total):
+    loss = make_loss("whole", world_model)
+    optimizer = torch.optim.Adam(loss.parameters())
+    total(loss(slices)).backward()
+    step = torch.compile(optimizer.step, backend="eager")
+    for _ in range(3):
+        step()
+    assert world_model.version == 3
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+def test_the_count_is_part_of_the_state_and_goes_on_from_there(
+    make_loss, make_world_model, kind, slices, total, updates
+):
+    loss = make_loss(kind, make_world_model(termination=True))
+    train(loss, torch.optim.Adam(loss.parameters()), slices=slices, total=total, steps=updates)
+    other = make_loss(kind, make_world_model(termination=True))
+    keys = other.load_state_dict(loss.state_dict())
+    assert not keys.missing_keys and not keys.unexpected_keys
+    assert other.world_model.version == updates
+    train(other, torch.optim.Adam(other.parameters()), slices=slices, total=total)
+    assert other.world_model.version == updates + 3
+    assert loss.world_model.version == updates  # the state was copied
+
+
+def test_a_state_of_before_keeps_the_count_that_is_there(make_loss, world_model):
+    loss = make_loss("whole", world_model)
+    world_model.version.fill_(7)
+    state = {name: value for name, value in loss.state_dict().items() if name != "version"}
+    loss.load_state_dict(state)
+    assert world_model.version == 7
+
+
+def test_torchrl_s_checkpoint_of_the_loss_restores_the_count(make_loss, make_world_model, slices, total, tmp_path):
+    loss = make_loss("whole", make_world_model(termination=True))
+    train(loss, torch.optim.Adam(loss.parameters()), slices=slices, total=total)
+    Checkpoint(loss=loss).save(tmp_path / "checkpoint")
+    other = make_loss("whole", make_world_model(termination=True))
+    Checkpoint(loss=other).load(tmp_path / "checkpoint")
+    assert other.world_model.version == 3
+    SoftUpdate(other, tau=0.1)
+
+
+def test_a_world_model_that_nobody_holds_is_let_go(make_loss, make_world_model):
+    loss = make_loss("whole", make_world_model())
+    alive = weakref.ref(loss.world_model)
+    del loss
+    gc.collect()
+    assert alive() is None
