@@ -312,6 +312,8 @@ REFUSED_AT_ONCE = [
     ({"reanalyze__every": -1}, "reanalyze.every must not be negative, got -1."),
     ({"loss__slice_len": 501}, "loss.slice_len must fit into an episode of 500 decisions, got 501."),
     ({"loss__kl_direction": "both"}, "loss.kl_direction must be one of backward, forward, got 'both'."),
+    ({"optim__lr": float("nan")}, "optim.lr must be a finite number below 1e30, got nan."),
+    ({"model__latent_dim": 1e16}, "model.latent_dim must be a whole number below 2**53, got 1e+16."),
     ({"optim__batch_size": 0}, "optim.batch_size must be at least 1, got 0."),
     ({"optim__updates_per_decision": 0}, "optim.updates_per_decision must be at least 1, got 0."),
     ({"replay__capacity": 0}, "replay.capacity must be at least 1, got 0."),
@@ -427,7 +429,6 @@ REFUSED_BY_A_PART = [
     ({"loss__discount": 1.01}, "loss.discount must be in (0, 1], got 1.01; see discount_from_episode_length."),
     ({"loss__discount": 0.0}, "loss.discount must be in (0, 1], got 0.0; see discount_from_episode_length."),
     ({"optim__lr": 0.0}, "optim.lr must be positive, got 0.0."),
-    ({"optim__lr": float("nan")}, "optim.lr must be positive, got nan."),
     ({"optim__grad_clip_norm": 0.0}, "optim.grad_clip_norm must be positive, got 0.0."),
     ({"optim__encoder_lr_scale": -0.3}, "optim.encoder_lr_scale must not be negative, got -0.3."),
 ]

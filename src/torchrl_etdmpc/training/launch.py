@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torchrl import torchrl_logger
 
 from torchrl_etdmpc.checkpoints import CheckpointStore
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
 from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.estimate import what_it_takes
 from torchrl_etdmpc.training.train import TrainingRun
 
 CHANGEABLE = {
@@ -130,6 +132,8 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
             log.start_over()
         directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
         directory.write_config(config.to_dict())
+        total, takes = config.total_env_steps, what_it_takes(config, run.learner.agent.device)
+        torchrl_logger.info(f"{config.task} with preset {config.preset}, {total:,} env steps into {directory}: {takes}")
         summary = run.run()
     return (
         f"{config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
