@@ -38,6 +38,12 @@ def main(command: str | None = None) -> None:
         signal.signal(signal.SIGINT, _leave)
     try:
         module = importlib.import_module(f"{__name__}.{command}")
+    except Exception as error:  # MuJoCo's import fails in a dozen ways where a renderer is missing
+        backend = os.environ["MUJOCO_GL"]
+        if backend == "disable" or os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
+            raise
+        reason = " ".join(str(error).split())
+        sys.exit(f"error: cannot render with MUJOCO_GL={backend} ({reason}); try MUJOCO_GL=egl, or leave the film out.")
     finally:
         if quiet:
             signal.signal(signal.SIGINT, handler)

@@ -11,6 +11,7 @@ given (`NAME=PATH`).
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from pathlib import Path
@@ -67,7 +68,9 @@ def parse() -> argparse.Namespace:
 def named(argument: str) -> tuple[str | None, str]:
     """The name and the path of one argument; a path that exists is a path, whatever it is called."""
     name, separator, path = argument.partition("=")
-    return (name, path) if separator and not Path(argument).exists() else (None, argument)
+    if separator and not Path(argument).expanduser().exists():
+        return name, os.path.expanduser(path)
+    return None, os.path.expanduser(argument)
 
 
 def read(arguments: argparse.Namespace) -> tuple[Table, list[str]]:
@@ -178,7 +181,7 @@ def report(arguments: argparse.Namespace, references: list[Table]) -> str:
         budget=budget,
         grid_step=grid_step,
     )
-    page = write_report(comparison, arguments.out, vector=arguments.vector)
+    page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]
     last = chosen["env_steps"].max()
     counts = f"{count} run{'s' * (count > 1)} on {len(tasks)} task{'s' * (len(tasks) > 1)} of {benchmark.title}"

@@ -5,7 +5,15 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from torchrl_etdmpc.training import EXIT_CODE, RunInterrupted, TrainConfig, explicit_settings, hydra_main, launch
+from torchrl_etdmpc.training import (
+    EXIT_CODE,
+    RunInterrupted,
+    TrainConfig,
+    as_typed,
+    explicit_settings,
+    hydra_main,
+    launch,
+)
 
 CONFIG = str(Path(__file__).parent / "config")
 
@@ -21,5 +29,5 @@ def train(config: TrainConfig) -> None:
     try:
         print(launch(config, explicit_settings()))
     except RunInterrupted as stop:
-        print(stop)
+        print(as_typed(str(stop)))
         sys.exit(EXIT_CODE)

@@ -50,6 +50,11 @@ class Task:
         for field in ("action_repeat", "episode_length"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} of task {self.name!r} must be at least 1, got {getattr(self, field)}.")
+        if self.action_repeat > self.episode_length:
+            raise ValueError(
+                f"action_repeat of task {self.name!r} must be at most episode_length={self.episode_length}, got "
+                f"{self.action_repeat}."
+            )
 
     @property
     def decision_steps_per_episode(self) -> int:

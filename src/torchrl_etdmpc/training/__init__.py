@@ -10,7 +10,7 @@ from torchrl_etdmpc.training.builders import (
     resolve_device,
     row_bytes,
 )
-from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, one_line_errors
+from torchrl_etdmpc.training.command_line import as_typed, explicit_settings, hydra_main, one_line_errors
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.estimate import estimated_seconds, what_it_takes
 from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
@@ -35,6 +35,7 @@ __all__ = [
     "TrainConfig",
     "TrainingRun",
     "Updater",
+    "as_typed",
     "build_agent",
     "build_collector",
     "build_planner",

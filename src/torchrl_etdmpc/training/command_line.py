@@ -31,13 +31,28 @@ def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
             main(*args)
         except KeyboardInterrupt:
             sys.exit(130)
+        except BrokenPipeError:  # whoever read the output has gone, e.g. head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(141)
         except Exception as error:
             if os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
                 raise
-            text = " ".join(str(error).split())
+            text = as_typed(" ".join(str(error).split()))
             sys.exit(f"error: {text or type(error).__name__}")
 
     return wrapped
+
+
+def as_typed(text: str) -> str:
+    """A message in the words of ``make``, if that is what was typed: its variables in the place of settings.
+
+    >>> as_typed("run_dir=runs/a already holds a run")
+    'run_dir=runs/a already holds a run'
+    """
+    if os.environ.get("TORCHRL_ETDMPC_MAKE") != "1":
+        return text
+    text = re.sub(r"\b(resume=\w+)", r'ARGS="\1"', text)
+    return re.sub(r"\brun_dir\b", "RUN_DIR", text)
 
 
 def hydra_main(

@@ -224,11 +224,16 @@ class TrainConfig:
         least_one |= {"optim.updates_per_decision": self.optim.updates_per_decision}
         for name, number in least_one.items():
             _require(number is None or number >= 1, f"{name} must be at least 1, got {number}.")
+        coefficients = {f"loss.{name}": value for name, value in vars(self.loss).items() if name.endswith("_coef")}
         for name, number in {
+            "replay.seed_decisions": self.seed_decisions,
             "replay.pretrain_updates": self.pretrain_updates,
             "reanalyze.every": self.reanalyze.every,
+            **coefficients,
         }.items():
             _require(number >= 0, f"{name} must not be negative, got {number}.")
+        for name, most in {"num_envs": 4096, "threads": 4096, "eval_episodes": 10_000}.items():  # each is one in memory
+            _require((getattr(self, name) or 0) <= most, f"{name} must be at most {most}, got {getattr(self, name)}.")
         self._check_against_the_episode(self.task_spec)
 
     def _check_against_the_episode(self, task: Task) -> None:
@@ -247,7 +252,7 @@ class TrainConfig:
         _require(
             self.total_env_steps > seed_env_steps,
             f"total_env_steps must exceed the random phase of {seed_env_steps} env steps, got {self.total_env_steps}; "
-            "raise the budget or lower replay.seed_decisions.",
+            f"raise the budget or lower replay.seed_decisions{' or task.episode_length' * bool(self.episode_length)}.",
         )
         _require(
             self.seed_decisions >= slice_len * self.num_envs,

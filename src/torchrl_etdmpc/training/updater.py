@@ -71,7 +71,8 @@ class Updater:
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
-        SoftUpdate(loss, tau=tau)  # tells the loss that its targets follow
+        # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
+        SoftUpdate(loss, tau=min(tau, 0.5))
         values = dict(loss.value_params.flatten_keys(".").items())
         targets = dict(loss.target_value_params.flatten_keys(".").items())
         heads = [name for name in ("dynamics", "reward", "termination") if f"{name}_params" in loss._modules]
