@@ -1,26 +1,46 @@
 # Every target makes .venv first if it is missing or older than what it was made from.
 
 PYTHON ?= python3
-RUN_DIR ?= runs/walker-stand
+TASK ?= walker-stand
+RUN_DIR ?= runs/$(TASK)
 JOBS ?= 2
 ARGS ?=
 
 VENV := .venv
 READY := $(VENV)/.ready
+# What was typed, for what to type next.
+SAME_RUN = $(if $(filter command line,$(origin RUN_DIR)), RUN_DIR="$(RUN_DIR)",$(if $(filter command line,$(origin TASK)), TASK=$(TASK)))
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint bench clean
+.PHONY: help train watch report test lint bench clean
 
 help:
-	@echo "make train   train on walker-stand on a CPU (RUN_DIR=runs/walker-stand, ARGS=\"more options\")"
+	@echo "make train   train on a CPU in minutes (TASK=walker-stand, RUN_DIR=runs/TASK, ARGS=\"more settings\")"
+	@echo "make watch   film the agent of RUN_DIR into RUN_DIR/film.mp4"
+	@echo "make report  curves and tables of RUN_DIR beside published baselines"
 	@echo "make test    run the tests and the examples in docstrings, JOBS=2 files at a time (ARGS=\"pytest options\")"
 	@echo "make lint    check style, format and types, as the commit hooks and CI do"
 	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
 	@echo "make clean   remove .venv, caches and build output; runs/ stays"
 	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
 
+# The command then speaks of RUN_DIR and ARGS, as they were typed here.
+train: export TORCHRL_ETDMPC_MAKE := 1
 train: $(READY)
-	@$(VENV)/bin/python examples/train_dmc.py task=walker-stand preset=cpu seed=1 total_env_steps=25000 eval_every=5000 run_dir=$(RUN_DIR) $(ARGS)
+	@echo "$(TASK) learns on this CPU: the first minutes compile, then there are about 5 more; Ctrl-C stops and saves"
+	@$(VENV)/bin/python examples/train_dmc.py task=$(TASK) preset=cpu seed=1 total_env_steps=25000 eval_every=5000 run_dir="$(RUN_DIR)" $(ARGS)
+	@echo 'the curve:        $(RUN_DIR)/curve.png'
+	@echo 'a film of it:     make watch$(SAME_RUN)'
+	@echo 'a report:         make report$(SAME_RUN)'
+	@echo 'train on:         make train$(SAME_RUN) ARGS="resume=true total_env_steps=50000"'
+	@echo 'another task:     make train TASK=cup-catch'
+	@echo 'all tasks, help:  $(VENV)/bin/python examples/train.py task=list    $(VENV)/bin/python examples/train.py --help'
+
+watch: $(READY)
+	@$(VENV)/bin/python examples/evaluate.py checkpoint="$(RUN_DIR)/checkpoints/best.pt" episodes=1 video="$(RUN_DIR)/film.mp4" $(ARGS)
+
+report: $(READY)
+	@$(VENV)/bin/python examples/report.py "$(RUN_DIR)" --out "$(RUN_DIR)/report" $(ARGS)
 
 # In the order of their names: the files with few tests, which would otherwise come last, take longest.
 test: export MUJOCO_GL ?= disable

@@ -11,6 +11,8 @@ import pytest
 import torch
 import yaml
 
+from torchrl_etdmpc.commands.evaluate import EvaluateConfig
+from torchrl_etdmpc.commands.export import ExportConfig
 from torchrl_etdmpc.envs import check_env, import_task, make_env
 from torchrl_etdmpc.training import PRESETS, TrainConfig
 from torchrl_etdmpc.training.config import config_from_dict
@@ -91,17 +93,18 @@ def test_a_command_names_settings_and_options_that_exist(command, own_module, mo
     path, arguments = ROOT / script, words[words.index(script) + 1 :]
     assert path.is_file()
     if script.endswith("report.py"):
+        from torchrl_etdmpc.commands import report
+
         monkeypatch.setattr("sys.argv", [script, *arguments])
-        runpy.run_path(str(path))["parse"]()
+        report.parse()
         return
     arguments += [] if "--cfg" in arguments else ["--cfg", "job"]
     monkeypatch.setattr("sys.argv", [script, *arguments])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # the script sets it; this restores it
     runpy.run_path(str(path), run_name="__main__")  # prints the settings and does nothing else
     settings = yaml.safe_load(capsys.readouterr().out)
-    kinds = {"train.py": "TrainConfig", "train_dmc.py": "TrainConfig", "evaluate.py": "EvaluateConfig"}
-    kind = kinds.get(path.name, "ExportConfig")
-    config_from_dict(TrainConfig if kind == "TrainConfig" else runpy.run_path(str(path))[kind], settings)
+    kinds = {"evaluate.py": EvaluateConfig, "export.py": ExportConfig}
+    config_from_dict(kinds.get(path.name, TrainConfig), settings)
 
 
 @pytest.mark.parametrize("command", commands("make "))

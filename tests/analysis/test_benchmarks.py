@@ -12,7 +12,7 @@ pytest.importorskip("pandas")
 from torchrl_etdmpc.analysis import BENCHMARKS, benchmark_of, get_benchmark  # noqa: E402
 from torchrl_etdmpc.envs import get_task  # noqa: E402
 
-THESIS_TABLES = Path(__file__).resolve().parents[2] / "benchmarks" / "reference" / "thesis_tables.csv"
+THESIS_TABLES = Path(__file__).resolve().parents[2] / "src/torchrl_etdmpc/analysis/reference/thesis_tables.csv"
 ALL = [(benchmark.name, task) for benchmark in BENCHMARKS.values() for task in benchmark.tasks]
 
 

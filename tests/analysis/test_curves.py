@@ -18,7 +18,7 @@ import pandas as pd  # noqa: E402
 from torchrl_etdmpc.analysis import estimate, find_runs, read_curves, read_run, read_runs  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
 
-REFERENCE = Path(__file__).resolve().parents[2] / "benchmarks" / "reference"
+REFERENCE = Path(__file__).resolve().parents[2] / "src" / "torchrl_etdmpc" / "analysis" / "reference"
 HEADER = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes\n"
 CONFIG = "task: {task}\npreset: {preset}\nseed: {seed}\nmodel:\n  latent_dim: 16\n"
 PER_SEED = "method,task,seed,env_steps,return_mean\n"

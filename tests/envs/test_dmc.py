@@ -322,7 +322,7 @@ def test_a_missing_dm_control_is_one_line_that_says_what_to_install(monkeypatch)
     with pytest.raises(ImportError) as error:
         make_env("walker-walk")
     assert str(error.value) == (
-        "dm_control tasks need dm-control, which is missing; run: pip install torchrl_etdmpc[dmc]"
+        "dm_control tasks need dm-control, which is missing; run: pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
     )
 
 
@@ -340,7 +340,7 @@ def test_a_mujoco_that_breaks_this_dm_control_is_refused_in_one_line(mujoco, dm_
         make_env("pendulum-swingup")
     assert str(error.value) == (
         f"dm-control {dm_control} does not work with mujoco {mujoco}; "
-        "run in a fresh virtual environment: pip install torchrl_etdmpc[dmc]"
+        "run in a fresh virtual environment: pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
     )
 
 

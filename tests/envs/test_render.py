@@ -72,7 +72,8 @@ def test_a_missing_pygame_is_one_line_that_says_what_to_install(monkeypatch):
     with pytest.raises(RuntimeError) as error:
         render_frame(env)
     assert str(error.value) == (
-        "cannot render Pendulum-v1: pygame is not installed; run: pip install torchrl_etdmpc[gym]"
+        "cannot render Pendulum-v1: pygame is not installed; run: "
+        "pip install 'gymnasium[mujoco,classic-control]>=1.4,<2' 'mujoco<4'"
     )
 
 

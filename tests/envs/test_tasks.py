@@ -28,12 +28,12 @@ def test_an_unknown_name_is_answered_with_the_nearest_names_in_one_line():
         get_task("walker-stnad")
     assert str(error.value) == (
         "unknown task 'walker-stnad'; did you mean walker-stand, walker-run, walker-walk? "
-        "All names: torchrl_etdmpc.envs.DMC_TASKS, and gym/<id> for Gymnasium's."
+        "task=list on the command line lists all."
     )
 
 
 def test_a_name_that_is_near_to_nothing_gets_no_suggestion():
-    with pytest.raises(ValueError, match=r"^unknown task 'zzzz'; All names: torchrl_etdmpc\.envs\.DMC_TASKS, and gym/"):
+    with pytest.raises(ValueError, match=r"^unknown task 'zzzz'; task=list on the command line lists all\.$"):
         get_task("zzzz")
 
 
@@ -162,6 +162,7 @@ def test_a_missing_gymnasium_is_one_line_that_says_what_to_install(monkeypatch):
     with pytest.raises(ImportError) as error:
         get_task("gym/Pendulum-v1")
     assert str(error.value) == (
-        "task 'gym/Pendulum-v1' needs gymnasium, which is missing; run: pip install torchrl_etdmpc[gym]"
+        "task 'gym/Pendulum-v1' needs gymnasium, which is missing; run: "
+        "pip install 'gymnasium[mujoco,classic-control]>=1.4,<2' 'mujoco<4'"
     )
     assert get_task("walker-walk").suite == "dm_control"

@@ -150,8 +150,10 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main):
         pictures.append(torch.zeros(2, 2, 3, dtype=torch.uint8))
         return pictures[-1]
 
-    monkeypatch.setattr("torchrl_etdmpc.envs.render_frame", render_frame)
-    monkeypatch.setattr("torchrl_etdmpc.runs.write_mp4", lambda frames, path, fps: films.append(len(frames)))
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.render_frame", render_frame)
+    monkeypatch.setattr(
+        "torchrl_etdmpc.commands.evaluate.write_film", lambda frames, path, fps: films.append(len(frames))
+    )
     message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "device=cpu", "video=a.mp4")
     assert (message, err) == (None, "")
     agent, config, _ = load_agent(checkpoint)
@@ -165,7 +167,7 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "Missing mandatory value: checkpoint"),
+        ([], "checkpoint=... is missing: an agent file, e.g. runs/"),
         (["checkpoint=nowhere.pt"], "nowhere.pt is not a file; pass a checkpoint such as "),
         (["checkpoint=noise.pt"], "noise.pt is not a readable checkpoint ("),
         (["checkpoint=other.pt"], "other.pt is a PyTorch file but not a checkpoint of torchrl_etdmpc."),
@@ -173,9 +175,9 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main):
         (["checkpoint=GOOD", "task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
         (["checkpoint=GOOD", "episodes=0"], "episodes must be at least 1, got 0."),
         (["checkpoint=GOOD", "episodes=many"], "episodes must be of type int, got 'many'."),
-        (["checkpoint=GOOD", "policy=best"], "policy must be planner or bare, got 'best'."),
-        (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4, got 'film.avi'."),
-        (["checkpoint=GOOD", "epsiodes=2"], "Could not override 'epsiodes'. "),
+        (["checkpoint=GOOD", "policy=best"], "policy must be one of planner, bare, got 'best'."),
+        (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4 or .gif, got 'film.avi'."),
+        (["checkpoint=GOOD", "epsiodes=2"], "unknown setting epsiodes; did you mean episodes?"),
         (["checkpoint=GOOD", "device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use "),
     ],
 )
@@ -197,8 +199,8 @@ def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, m
     def no_episodes(*args, **options):
         raise AssertionError("the episodes had begun")
 
-    monkeypatch.setattr("torchrl_etdmpc.envs.render_frame", render_frame)
-    monkeypatch.setattr("torchrl_etdmpc.collectors.evaluate", no_episodes)
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.render_frame", render_frame)
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.evaluate", no_episodes)
     error, out, err = run_main(f"checkpoint={checkpoint}", "video=film.mp4", "device=cpu")
     assert error == "error: cannot render: there is no display; set MUJOCO_GL=egl before Python starts."
     assert (out, err) == ("", "")
@@ -208,8 +210,10 @@ def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, m
 # Runs the script with frames that are quickly drawn.
 SMALL_FRAMES = """
 import functools, runpy, sys
-import torchrl_etdmpc.envs
-torchrl_etdmpc.envs.render_frame = functools.partial(torchrl_etdmpc.envs.render_frame, height=48, width=64)
+import os
+os.environ["MUJOCO_GL"] = "egl"
+from torchrl_etdmpc.commands import evaluate
+evaluate.render_frame = functools.partial(evaluate.render_frame, height=48, width=64)
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

@@ -39,9 +39,7 @@ def test_a_missing_package_is_named(monkeypatch, logger, check):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError) as caught:
         check(logger)
-    assert str(caught.value) == (
-        f"logger={logger} needs {logger}, which is not installed; run `pip install torchrl_etdmpc[{logger}]`."
-    )
+    assert str(caught.value) == (f"logger={logger} needs {logger}, which is not installed; run `pip install {logger}`.")
 
 
 def test_a_folder_called_wandb_does_not_pass_for_the_package(monkeypatch):

@@ -8,7 +8,9 @@ import pytest
 
 pytest.importorskip("tqdm")
 
-from torchrl_etdmpc.runs import progress_bar  # noqa: E402
+from torchrl import torchrl_logger  # noqa: E402
+
+from torchrl_etdmpc.runs import console, progress_bar  # noqa: E402
 
 
 class Terminal(io.StringIO):
@@ -16,28 +18,59 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_shows_steps_the_last_return_and_decisions_per_second(monkeypatch):
+def one_terminal(monkeypatch):
+    """Standard output and error on one terminal; not a fixture, because pytest sets both anew before the test."""
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    with progress_bar(1000, initial=200) as bar:
-        for env_steps, last_return in ((400, 31.25), (600, None), (800, None)):
+    monkeypatch.setattr(sys, "stdout", terminal)
+    return terminal
+
+
+def test_a_terminal_shows_phase_steps_time_left_and_the_last_note(monkeypatch):
+    terminal = one_terminal(monkeypatch)
+    with progress_bar("learning", 1000, "env steps", initial=200) as bar:
+        for env_steps, note in ((400, "return 31.2"), (600, None), (800, None)):
             time.sleep(0.12)  # a bar is drawn at most every 0.1 s
-            bar.update(env_steps=env_steps, decision_steps=env_steps // 2, last_return=last_return)
-    text = terminal.getvalue()
-    assert "800/1000 env steps" in text
-    assert "return 31.2" in text.splitlines()[-1]  # the last one stays
-    assert "decisions/s" in text
+            bar.update(env_steps, note)
+    last = terminal.getvalue().splitlines()[-1].split("\r")[-1]
+    assert last.startswith("learning ")
+    assert " 80%|" in last
+    assert "| 800/1000 env steps, 00:00 left, return 31.2" in last
 
 
-def test_a_file_gets_nothing(monkeypatch):
-    file = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", file)
-    with progress_bar(1000) as bar:
-        bar.update(env_steps=400, decision_steps=200, last_return=31.25)
-    assert file.getvalue() == ""
+def test_a_bar_of_a_part_that_passes_leaves_nothing(monkeypatch):
+    terminal = one_terminal(monkeypatch)
+    with progress_bar("evaluation", 10, "decisions", passing=True) as bar:
+        time.sleep(0.12)
+        bar.advance()
+    assert "evaluation" in terminal.getvalue()
+    assert terminal.getvalue().split("\r")[-1].strip() == ""
+
+
+def test_a_line_of_the_log_stands_above_the_bar_and_not_beside_it(monkeypatch):
+    terminal = one_terminal(monkeypatch)
+    with console(), progress_bar("learning", 1000, "env steps") as bar:
+        time.sleep(0.12)
+        bar.update(500)
+        torchrl_logger.warning("half of it")
+    line = next(line for line in terminal.getvalue().split("\n") if "half of it" in line)
+    shown = line.split("\r")[-1]
+    assert "learning" not in shown
+    assert shown.endswith(" half of it")
+
+
+def test_a_file_gets_plain_lines_in_the_log_with_the_time_left(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with console(), progress_bar("learning", 1000, "env steps", log_every_s=0.05) as bar:
+        time.sleep(0.1)
+        bar.update(400, "return 31.2")
+        bar.update(401)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line[8:] == " learning: 400 of 1000 env steps, 0 s left, return 31.2"
+    assert sys.stderr.getvalue() == ""
 
 
 def test_a_missing_tqdm_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
     with pytest.raises(ImportError, match=r"^progress_bar needs tqdm, .*; run `pip install tqdm`\.$"):
-        progress_bar(10)
+        progress_bar("learning", 10, "env steps")

@@ -310,8 +310,17 @@ REFUSED_AT_ONCE = [
         "reanalyze.eval_first_action must be one of elite, mean, best, got 'any'.",
     ),
     ({"reanalyze__every": -1}, "reanalyze.every must not be negative, got -1."),
+    *(
+        ({f"loss__{name}_coef": -1.0}, f"loss.{name}_coef must not be negative, got -1.0.")
+        for name in ("consistency", "reward", "value", "termination", "entropy")
+    ),
+    ({"replay__seed_decisions": -1}, "replay.seed_decisions must not be negative, got -1."),
+    ({"eval_episodes": 20_000}, "eval_episodes must be at most 10000, got 20000."),
+    ({"action_repeat": 1001}, "action_repeat of task 'walker-walk' must be at most episode_length=1000, got 1001."),
     ({"loss__slice_len": 501}, "loss.slice_len must fit into an episode of 500 decisions, got 501."),
     ({"loss__kl_direction": "both"}, "loss.kl_direction must be one of backward, forward, got 'both'."),
+    ({"optim__lr": float("nan")}, "optim.lr must be a finite number below 1e30, got nan."),
+    ({"model__latent_dim": 1e16}, "model.latent_dim must be a whole number below 2**53, got 1e+16."),
     ({"optim__batch_size": 0}, "optim.batch_size must be at least 1, got 0."),
     ({"optim__updates_per_decision": 0}, "optim.updates_per_decision must be at least 1, got 0."),
     ({"replay__capacity": 0}, "replay.capacity must be at least 1, got 0."),
@@ -391,6 +400,14 @@ REFUSED_BY_A_PART = [
     ),
     ({"model__num_bins": 1}, "model.num_bins must be at least 2, got 1."),
     ({"model__bin_min": 10.0}, "model.bin_min must be below bin_max=10.0, got 10.0."),
+    (
+        {"model__bin_max": 100.0},
+        "model.bin_max must be in [-80, 80], where single precision holds symexp of it, got 100.0.",
+    ),
+    (
+        {"model__log_std_max": 50.0},
+        "model.log_std_max must be in [-40, 40], where exp of it and its square are numbers, got 50.0.",
+    ),
     ({"model__log_std_min": 1.0}, "model.log_std_min must be below log_std_max=1.0, got 1.0."),
     ({"model__dropout": 1.0}, "model.dropout must be in [0, 1), got 1.0."),
     ({"planner__num_elites": 600}, "planner.num_elites must be at most num_samples=512, got 600."),
@@ -427,7 +444,6 @@ REFUSED_BY_A_PART = [
     ({"loss__discount": 1.01}, "loss.discount must be in (0, 1], got 1.01; see discount_from_episode_length."),
     ({"loss__discount": 0.0}, "loss.discount must be in (0, 1], got 0.0; see discount_from_episode_length."),
     ({"optim__lr": 0.0}, "optim.lr must be positive, got 0.0."),
-    ({"optim__lr": float("nan")}, "optim.lr must be positive, got nan."),
     ({"optim__grad_clip_norm": 0.0}, "optim.grad_clip_norm must be positive, got 0.0."),
     ({"optim__encoder_lr_scale": -0.3}, "optim.encoder_lr_scale must not be negative, got -0.3."),
 ]

@@ -1,6 +1,6 @@
 """Learning curves, areas, tables and figures, from files: nothing here needs the learning code.
 
-Needs ``pip install torchrl_etdmpc[analysis]``.
+Needs ``pip install matplotlib pandas pyyaml scipy``.
 """
 
 try:
@@ -10,7 +10,7 @@ try:
     import yaml
 except ImportError as error:
     raise ImportError(
-        f"torchrl_etdmpc.analysis needs {error.name}, which is not installed; run: pip install torchrl_etdmpc[analysis]"
+        f"reports need {error.name}, which is not installed; run: pip install matplotlib pandas pyyaml scipy"
     ) from error
 
 from torchrl_etdmpc.analysis.benchmarks import (

@@ -6,7 +6,7 @@ from torchrl_etdmpc.envs.check import check_env, check_spaces
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.make import make_env
 from torchrl_etdmpc.envs.render import render_frame
-from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, register_task
+from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, list_tasks, register_task
 from torchrl_etdmpc.envs.user_task import import_task
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "check_spaces",
     "get_task",
     "import_task",
+    "list_tasks",
     "load_simulator_state",
     "make_env",
     "register_task",

@@ -20,6 +20,7 @@ from torchrl_etdmpc.envs.tasks import Maker, Task
 
 __all__ = ["RecordedDMControlEnv", "dmc_maker", "domain_and_task"]
 
+_INSTALL = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
 # The last dm_control release known to need MuJoCo 3.
 _LAST_FOR_MUJOCO_3 = (1, 0, 50)
 # The benchmark tables shorten one domain name.
@@ -71,14 +72,14 @@ def dmc_maker(task: Task) -> Maker:
         ImportError: if dm-control is missing, or if it cannot work with the installed MuJoCo.
     """
     if importlib.util.find_spec("dm_control") is None:
-        raise ImportError("dm_control tasks need dm-control, which is missing; run: pip install torchrl_etdmpc[dmc]")
+        raise ImportError(f"dm_control tasks need dm-control, which is missing; run: {_INSTALL}")
     mujoco = importlib.metadata.version("mujoco")
     dm_control = importlib.metadata.version("dm-control")
     if _release(mujoco) >= (4,) and _release(dm_control) <= _LAST_FOR_MUJOCO_3:
         # MuJoCo 4 shares files with packages that a downgrade leaves behind, hence the fresh environment.
         raise ImportError(
             f"dm-control {dm_control} does not work with mujoco {mujoco}; "
-            "run in a fresh virtual environment: pip install torchrl_etdmpc[dmc]"
+            f"run in a fresh virtual environment: {_INSTALL}"
         )
     return _make
 

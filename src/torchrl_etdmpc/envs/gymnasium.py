@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from torchrl_etdmpc.envs.episode import RecordedEnv
-from torchrl_etdmpc.envs.tasks import Maker, Task
+from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM, Maker, Task
 
 __all__ = ["RecordedGymnasiumEnv", "gymnasium_maker"]
 
@@ -82,7 +82,7 @@ def gymnasium_maker(task: Task) -> Maker:
         ValueError: if the id is unknown.
     """
     if importlib.util.find_spec("gymnasium") is None:
-        raise ImportError(f"task {task.name!r} needs gymnasium, which is missing; run: pip install torchrl_etdmpc[gym]")
+        raise ImportError(f"task {task.name!r} needs gymnasium, which is missing; run: {INSTALL_GYMNASIUM}")
     import gymnasium
 
     spec = gymnasium.registry.get(task.name.removeprefix("gym/"))
@@ -109,7 +109,7 @@ def _make(spec: Any, task: Task, *, device: torch.device | str) -> RecordedGymna
             )
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
-        hint = "torchrl_etdmpc[gym] installs what MuJoCo and classic control need"
+        hint = f"for MuJoCo and classic control run: {INSTALL_GYMNASIUM}"
         raise ImportError(f"{task.name} cannot be made: {reason} ({hint}).") from error
     _require_vectors(task.name, env)
     return RecordedGymnasiumEnv(env, frame_skip=task.action_repeat, device=device)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torchrl.envs import DMControlEnv, EnvBase, GymWrapper, TransformedEnv
 
+from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM
+
 __all__ = ["render_frame"]
 
 _DMC_SIZE = 384
@@ -87,7 +89,7 @@ def _gymnasium_frame(base: GymWrapper, height: int | None, width: int | None) ->
         pixels = torch.from_numpy(base._env.render().copy())
     except DependencyNotInstalled as error:
         reason = " ".join(str(error).split(",")[0].split())
-        raise RuntimeError(f"cannot render {name}: {reason}; run: pip install torchrl_etdmpc[gym]") from error
+        raise RuntimeError(f"cannot render {name}: {reason}; run: {INSTALL_GYMNASIUM}") from error
     except Exception as error:  # every GL backend has its own error types
         raise RuntimeError(_cannot_render(str(error).rstrip("."))) from error
     size = _size(height, width, tuple(pixels.shape[:2]))

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import importlib.util
+import textwrap
+from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, Protocol
 
 import torch
 from torchrl.envs import EnvBase
 
-__all__ = ["DMC_TASKS", "EASY_DMC", "HARD_DMC", "Maker", "Task", "get_task", "register_task"]
+__all__ = ["DMC_TASKS", "EASY_DMC", "HARD_DMC", "Maker", "Task", "get_task", "list_tasks", "register_task"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,11 @@ class Task:
         for field in ("action_repeat", "episode_length"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} of task {self.name!r} must be at least 1, got {getattr(self, field)}.")
+        if self.action_repeat > self.episode_length:
+            raise ValueError(
+                f"action_repeat of task {self.name!r} must be at most episode_length={self.episode_length}, got "
+                f"{self.action_repeat}."
+            )
 
     @property
     def decision_steps_per_episode(self) -> int:
@@ -100,6 +107,7 @@ HARD_DMC: tuple[str, ...] = (
 DMC_TASKS: tuple[str, ...] = EASY_DMC + HARD_DMC
 """All 28 DeepMind Control tasks."""
 
+INSTALL_GYMNASIUM = "pip install 'gymnasium[mujoco,classic-control]>=1.4,<2' 'mujoco<4'"
 # Gymnasium's registry does not say which tasks never terminate; in the source of gymnasium 1.4 the `step` of these, in
 # every version, always returns terminated=False. (MountainCarContinuous, for one, terminates at its goal.)
 _GYMNASIUM_NEVER_TERMINATES = {"Pendulum", "HalfCheetah", "HumanoidStandup", "Pusher", "Reacher", "Swimmer"}
@@ -185,21 +193,56 @@ def get_task(
         raise ValueError(f"task {name!r} names code, which must be given on the command line: task={name}")
     nearest = difflib.get_close_matches(str(name), _tasks, n=3)
     hint = f"did you mean {', '.join(nearest)}? " if nearest else ""
-    raise ValueError(
-        f"unknown task {name!r}; {hint}All names: torchrl_etdmpc.envs.DMC_TASKS, and gym/<id> for Gymnasium's."
-    )
+    raise ValueError(f"unknown task {name!r}; {hint}task=list on the command line lists all.")
+
+
+def list_tasks() -> str:
+    """All tasks by suite, as a text.
+
+    >>> list_tasks().splitlines()[0]
+    'Easy DMC'
+    """
+    others = [name for name in _tasks if name not in DMC_TASKS]
+    groups = {"Easy DMC": EASY_DMC, "Hard DMC": HARD_DMC, "registered": others, "Gymnasium": _gymnasium_ids()}
+    lines = []
+    for title, names in groups.items():
+        if names:
+            lines += [title, *_columns(names), ""]
+    lines += [
+        "Gymnasium: gym/ID, for any other ID with actions within bounds and one vector as observation",
+        "your own: MODULE:FUNCTION, a function that returns a TorchRL environment",
+    ]
+    return "\n".join(lines)
+
+
+def _columns(names: Iterable[str]) -> list[str]:
+    return textwrap.wrap("  ".join(names), 78, break_on_hyphens=False, initial_indent="  ", subsequent_indent="  ")
+
+
+def _gymnasium_ids() -> list[str]:
+    """Those of MuJoCo and of classic control with continuous actions, in their newest versions."""
+    if importlib.util.find_spec("gymnasium") is None:
+        return []
+    import gymnasium
+
+    continuous = {"Pendulum", "MountainCarContinuous"}
+    newest: dict[str, int] = {}
+    for spec in gymnasium.registry.values():
+        if spec.version is not None and (spec.name in continuous or "mujoco" in str(spec.entry_point)):
+            newest[spec.name] = max(spec.version, newest.get(spec.name, 0))
+    return [f"gym/{name}-v{version}" for name, version in sorted(newest.items())]
 
 
 def _gymnasium_task(name: str, told: dict[str, Any]) -> Task:
     if importlib.util.find_spec("gymnasium") is None:
-        raise ImportError(f"task {name!r} needs gymnasium, which is missing; run: pip install torchrl_etdmpc[gym]")
+        raise ImportError(f"task {name!r} needs gymnasium, which is missing; run: {INSTALL_GYMNASIUM}")
     import gymnasium
 
     env_id = name.removeprefix("gym/")
     if env_id not in gymnasium.registry:
         nearest = difflib.get_close_matches(env_id, gymnasium.registry, n=3)
         hint = f"did you mean {', '.join(f'gym/{other}' for other in nearest)}? " if nearest else ""
-        raise ValueError(f"unknown task {name!r}; {hint}All ids: gymnasium.registry.")
+        raise ValueError(f"unknown task {name!r}; {hint}task=list on the command line lists those of MuJoCo.")
     limit = gymnasium.registry[env_id].max_episode_steps
     if limit is None and "episode_length" not in told:
         raise ValueError(f"Gymnasium sets no time limit for {env_id}; give one in env steps: task.episode_length=")

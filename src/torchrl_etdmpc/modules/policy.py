@@ -22,7 +22,7 @@ class GaussianPolicy(LayerStack):
         activation (str): of the hidden layers.
 
     Raises:
-        ValueError: if ``log_std_min`` is not below ``log_std_max``.
+        ValueError: if ``log_std_min`` is not below ``log_std_max``, or one of them beyond 40.
 
     >>> import torch
     >>> mean, log_std = GaussianPolicy(16, 2)(torch.zeros(7, 16))
@@ -42,6 +42,11 @@ class GaussianPolicy(LayerStack):
     ) -> None:
         if log_std_min >= log_std_max:
             raise ValueError(f"log_std_min must be below log_std_max={log_std_max}, got {log_std_min}.")
+        for name, bound in {"log_std_min": log_std_min, "log_std_max": log_std_max}.items():
+            if not abs(bound) <= 40:
+                raise ValueError(
+                    f"{name} must be in [-40, 40], where exp of it and its square are numbers, got {bound}."
+                )
         super().__init__(latent_dim, [hidden_dim] * 2, 2 * action_dim, activation=activation)
         self.log_std_bounds = (log_std_min, log_std_max)
 

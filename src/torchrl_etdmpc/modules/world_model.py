@@ -101,6 +101,11 @@ class WorldModel(nn.Module):
             raise ValueError(f"num_bins must be at least 2, got {num_bins}.")
         if bin_min >= bin_max:
             raise ValueError(f"bin_min must be below bin_max={bin_max}, got {bin_min}.")
+        for name, bound in {"bin_min": bin_min, "bin_max": bin_max}.items():
+            if not abs(bound) <= 80:
+                raise ValueError(
+                    f"{name} must be in [-80, 80], where single precision holds symexp of it, got {bound}."
+                )
         self.observation_dim = observation_dim
         self.action_dim = action_dim
         self.latent_dim = latent_dim

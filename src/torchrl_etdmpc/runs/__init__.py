@@ -1,5 +1,6 @@
 """A run directory: its files, its tables, its progress. Knows nothing of learning."""
 
+from torchrl_etdmpc.runs.console import console
 from torchrl_etdmpc.runs.directory import RunDirectory
 from torchrl_etdmpc.runs.errors import first_line
 from torchrl_etdmpc.runs.files import DamagedFileError, replacing
@@ -8,7 +9,7 @@ from torchrl_etdmpc.runs.log import COUNTER_COLUMNS, EVAL_COLUMNS, RunLog
 from torchrl_etdmpc.runs.loggers import LoggerName, make_logger, require_logger
 from torchrl_etdmpc.runs.progress_bar import ProgressBar, progress_bar
 from torchrl_etdmpc.runs.versions import library_versions
-from torchrl_etdmpc.runs.video import write_mp4
+from torchrl_etdmpc.runs.video import write_film, write_mp4
 
 __all__ = [
     "COUNTER_COLUMNS",
@@ -19,11 +20,13 @@ __all__ = [
     "ProgressBar",
     "RunDirectory",
     "RunLog",
+    "console",
     "first_line",
     "library_versions",
     "make_logger",
     "progress_bar",
     "replacing",
     "require_logger",
+    "write_film",
     "write_mp4",
 ]

@@ -33,9 +33,7 @@ def require_logger(name: LoggerName) -> None:
     spec = importlib.util.find_spec(name)
     # A plain folder called "wandb" (what wandb leaves behind in the working directory) is found too, without an origin.
     if spec is None or spec.origin is None:
-        raise ImportError(
-            f"logger={name} needs {name}, which is not installed; run `pip install torchrl_etdmpc[{name}]`."
-        )
+        raise ImportError(f"logger={name} needs {name}, which is not installed; run `pip install {name}`.")
 
 
 def make_logger(name: LoggerName, directory: RunDirectory, config: Mapping[str, Any]) -> Logger | None:

@@ -1,19 +1,31 @@
-"""A progress bar in the units of a training run."""
+"""A progress bar for one phase of a run."""
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 from typing import Any
 
+from torchrl import torchrl_logger
 
-def progress_bar(total_env_steps: int, *, initial: int = 0) -> ProgressBar:
-    """A bar on stderr: environment steps, last return, decisions per second, time left; silent off a terminal.
+_LINE_EVERY_S = 60.0
+
+
+def progress_bar(
+    phase: str, total: int, unit: str, *, initial: int = 0, passing: bool = False, log_every_s: float = _LINE_EVERY_S
+) -> ProgressBar:
+    """A bar on stderr: phase, share, steps, time left; where there is no terminal, a line in the log now and then.
 
     Args:
-        total_env_steps (int): length of the run in environment steps.
+        phase (str): what is being done, e.g. ``"learning"``.
+        total (int): how many steps it has.
+        unit (str): what they are, e.g. ``"env steps"``.
 
     Keyword Args:
-        initial (int): environment steps already done, for a run that goes on from a checkpoint. Default: 0.
+        initial (int): steps already done, for a phase that goes on. Default: 0.
+        passing (bool): whether the bar disappears when its phase ends, and stays silent without a terminal. Default:
+            ``False``.
+        log_every_s (float): seconds between two lines of the log. Default: 60.
 
     Returns:
         ProgressBar: a context manager.
@@ -21,56 +33,70 @@ def progress_bar(total_env_steps: int, *, initial: int = 0) -> ProgressBar:
     Raises:
         ImportError: if tqdm is not installed.
 
-    >>> with progress_bar(1000) as bar:
+    >>> with progress_bar("learning", 1000, "env steps") as bar:
     ...     for env_steps in range(2, 1001, 2):
-    ...         bar.update(env_steps=env_steps, decision_steps=env_steps // 2)
+    ...         bar.update(env_steps)
     """
     try:
         from tqdm import tqdm
     except ImportError as error:
         raise ImportError("progress_bar needs tqdm, which is not installed; run `pip install tqdm`.") from error
-    return ProgressBar(
-        tqdm(
-            total=total_env_steps,
-            initial=initial,
-            disable=None,  # silent when stderr is not a terminal
-            dynamic_ncols=True,
-            bar_format="{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} env steps [{elapsed}<{remaining}{postfix}]",
-        )
+    bar = tqdm(
+        total=total,
+        initial=initial,
+        unit=unit,
+        desc=f"{phase:12}",
+        disable=None,  # silent when stderr is not a terminal
+        leave=not passing,
+        position=None,
+        dynamic_ncols=True,
+        smoothing=0,  # evaluations and checkpoints interrupt a phase; its average holds them in their share
+        bar_format="{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {unit}, {remaining} left{postfix}",
     )
+    return ProgressBar(bar, phase, total, unit, initial, log_every_s if not passing else float("inf"))
 
 
 class ProgressBar:
     """Made by :func:`progress_bar`; takes absolute counters, so that a missed update costs nothing.
 
     Args:
-        bar (tqdm): counts environment steps.
+        bar (tqdm): counts the steps; disabled where there is no terminal.
+        phase (str): as are the next three, what :func:`progress_bar` was given.
+        total (int): how many steps it has.
+        unit (str): what they are.
+        initial (int): steps already done.
+        log_every_s (float): seconds between two lines of the log, where the bar is disabled.
     """
 
-    def __init__(self, bar: Any) -> None:
-        self._bar = bar
-        self._last_return: float | None = None
+    def __init__(self, bar: Any, phase: str, total: int, unit: str, initial: int, log_every_s: float) -> None:
+        self._bar, self._phase, self._total, self._unit = bar, phase, total, unit
+        self._log_every_s = log_every_s
+        self._began = self._logged = time.monotonic()
+        self._initial = self._done = initial
+        self._note = ""
 
-    def update(self, *, env_steps: int, decision_steps: int, last_return: float | None = None) -> None:
+    def update(self, done: int, note: str | None = None) -> None:
         """Moves the bar.
 
-        Keyword Args:
-            env_steps (int): environment steps so far.
-            decision_steps (int): actions chosen so far.
-            last_return (float, optional): of the last evaluation, if there is a new one; the bar keeps showing it.
+        Args:
+            done (int): steps so far.
+            note (str, optional): what else there is to know, e.g. the last return. Default: the last one stays.
         """
-        if self._bar.disable:
-            return
-        if last_return is not None:
-            self._last_return = last_return
-        rate = self._bar.format_dict["rate"]  # environment steps per second, smoothed; None at the start
-        fields = []
-        if self._last_return is not None:
-            fields.append(f"return {self._last_return:.1f}")
-        if rate is not None and env_steps > 0:
-            fields.append(f"{rate * decision_steps / env_steps:.1f} decisions/s")
-        self._bar.set_postfix_str(", ".join(fields), refresh=False)
-        self._bar.update(env_steps - self._bar.n)
+        self._note = self._note if note is None else note
+        if not self._bar.disable:
+            if note is not None:
+                self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(done - self._bar.n)
+        elif (now := time.monotonic()) - self._logged >= self._log_every_s:
+            self._logged = now
+            left = (now - self._began) * (self._total - done) / max(done - self._initial, 1)
+            parts = [f"{done} of {self._total} {self._unit}", f"{_duration(left)} left", self._note]
+            torchrl_logger.info(f"{self._phase}: {', '.join(part for part in parts if part)}")
+
+    def advance(self) -> None:
+        """Moves the bar by one step."""
+        self._done += 1
+        self.update(self._done)
 
     def close(self) -> None:
         """Leaves the bar as it stands and ends its line."""
@@ -83,3 +109,8 @@ class ProgressBar:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _duration(seconds: float) -> str:
+    minutes, hours = seconds / 60, seconds / 3600
+    return f"{hours:.1f} h" if hours >= 1 else f"{minutes:.0f} min" if minutes >= 1 else f"{seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""Frames to an mp4 file, with the ffmpeg that imageio-ffmpeg brings."""
+"""Frames to a film: mp4 with the ffmpeg that imageio-ffmpeg brings, or GIF with Pillow."""
 
 from __future__ import annotations
 
@@ -12,6 +12,60 @@ import numpy as np
 import torch
 
 from torchrl_etdmpc.runs.files import replacing
+
+_GIF_FPS, _GIF_COLOURS = 12.5, 64  # a GIF takes a multiple of 10 ms per picture, and grows with both
+
+
+def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathLike[str], fps: float) -> Path:
+    """Writes an ``.mp4`` or, for pages that show no video, a ``.gif`` of at most 12.5 pictures per second.
+
+    Args:
+        frames (iterable): as :func:`write_mp4` takes them.
+        path (str or Path): the file; its directory is made; an existing file is replaced.
+        fps (float): frames per second, above 0.
+
+    Returns:
+        Path: the file.
+
+    Raises:
+        ImportError: if imageio-ffmpeg, or for a GIF Pillow, is not installed.
+        ValueError: another suffix, or what :func:`write_mp4` refuses.
+        OSError: if ``path`` cannot be written.
+
+    >>> import tempfile
+    >>> frames = torch.zeros(50, 32, 48, 3, dtype=torch.uint8)
+    >>> write_film(frames, Path(tempfile.mkdtemp()) / "episode.gif", fps=25).name
+    'episode.gif'
+    """
+    path = Path(path).expanduser()
+    if path.suffix != ".gif":
+        return write_mp4(frames, path, fps)
+    if not fps > 0:
+        raise ValueError(f"fps must be above 0, got {fps}; 30 is usual.")
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError("a GIF needs Pillow, which is not installed; run `pip install pillow`.") from error
+    kept, shape = [], None
+    for index, frame in enumerate(frames):
+        array = _check_frame(frame, index, shape)
+        shape = array.shape
+        if not index % max(round(fps / _GIF_FPS), 1):
+            kept.append(Image.fromarray(np.ascontiguousarray(array)))
+    if not kept:
+        raise ValueError("frames must hold at least one frame, got none; record an episode first.")
+    palette = kept[0].quantize(_GIF_COLOURS)
+    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept]
+    milliseconds = 10 * round(100 * max(round(fps / _GIF_FPS), 1) / fps)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as partial:
+            pictures[0].save(
+                partial, "GIF", save_all=True, append_images=pictures[1:], duration=max(milliseconds, 20), loop=0
+            )
+    except OSError as error:
+        raise OSError(f"path={path} cannot be written ({error.strerror}); choose another path.") from error
+    return path
 
 
 def write_mp4(

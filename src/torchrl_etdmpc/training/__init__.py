@@ -10,8 +10,9 @@ from torchrl_etdmpc.training.builders import (
     resolve_device,
     row_bytes,
 )
-from torchrl_etdmpc.training.command_line import explicit_settings, hydra_main, one_line_errors
+from torchrl_etdmpc.training.command_line import as_typed, explicit_settings, hydra_main, one_line_errors
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.estimate import estimated_seconds, what_it_takes
 from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
 from torchrl_etdmpc.training.launch import Launch, launch, plan_launch, read_run_config, resumed_config
 from torchrl_etdmpc.training.learner import Learner
@@ -35,12 +36,14 @@ __all__ = [
     "TrainConfig",
     "TrainingRun",
     "Updater",
+    "as_typed",
     "build_agent",
     "build_collector",
     "build_planner",
     "build_reanalyze",
     "build_replay",
     "build_world_model",
+    "estimated_seconds",
     "explicit_settings",
     "hydra_main",
     "launch",
@@ -54,4 +57,5 @@ __all__ = [
     "resumed_config",
     "row_bytes",
     "save_agent",
+    "what_it_takes",
 ]

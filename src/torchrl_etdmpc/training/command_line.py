@@ -1,16 +1,22 @@
-"""The command line of the examples: Hydra overrides on a preset, and errors in one line."""
+"""The command line: Hydra overrides on a preset, and errors in one line."""
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import functools
 import os
+import re
 import sys
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from torchrl_etdmpc.envs import import_task
+from torchrl_etdmpc.envs import import_task, list_tasks
+from torchrl_etdmpc.runs import console, first_line
 from torchrl_etdmpc.training.config import TrainConfig, config_from_dict
 from torchrl_etdmpc.training.presets import PRESETS, preset
+from torchrl_etdmpc.training.settings_help import Setting, groups_of, help_text, settings_of
 
 
 def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
@@ -25,26 +31,37 @@ def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
             main(*args)
         except KeyboardInterrupt:
             sys.exit(130)
+        except BrokenPipeError:  # whoever read the output has gone, e.g. head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(141)
         except Exception as error:
             if os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
                 raise
-            causes: list[BaseException] = [error]
-            while _is_hydra(causes[-1]) and (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
-                causes.append(cause)
-            text = " ".join(" ".join(str(cause) for cause in causes).split())
+            text = as_typed(" ".join(str(error).split()))
             sys.exit(f"error: {text or type(error).__name__}")
 
     return wrapped
 
 
-def _is_hydra(error: BaseException) -> bool:
-    return type(error).__module__.startswith(("hydra", "omegaconf"))
+def as_typed(text: str) -> str:
+    """A message in the words of ``make``, if that is what was typed: its variables in the place of settings.
+
+    >>> as_typed("run_dir=runs/a already holds a run")
+    'run_dir=runs/a already holds a run'
+    """
+    if os.environ.get("TORCHRL_ETDMPC_MAKE") != "1":
+        return text
+    text = re.sub(r"\b(resume=\w+)", r'ARGS="\1"', text)
+    return re.sub(r"\brun_dir\b", "RUN_DIR", text)
 
 
 def hydra_main(
     config_path: str, config_name: str, config_class: type = TrainConfig
 ) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
-    """Decorates ``main(config)`` with Hydra's command line and the presets as its group ``preset``.
+    """Decorates ``main(config)`` with a command line: settings as Hydra's overrides, presets, ``--help``.
+
+    What was typed is checked before Hydra sees it, so that a mistake is named in the words of the command. The first
+    line of ``main``'s docstring is the first one of the help.
 
     Args:
         config_path (str): absolute folder of the YAML files.
@@ -59,30 +76,162 @@ def hydra_main(
         @one_line_errors
         @functools.wraps(main)
         def wrapped() -> None:
+            told = _answer(sys.argv[1:], config_class, (main.__doc__ or "").strip())
+            if told is not None:
+                print(told)
+                return
             try:
                 import hydra
                 from hydra.core.config_store import ConfigStore
                 from omegaconf import OmegaConf
+                from omegaconf.errors import OmegaConfBaseException
             except ImportError as error:
-                raise ImportError("the examples need hydra-core; run: pip install torchrl_etdmpc[train]") from error
-            sys.argv[1:] = [_without_task_prefix(argument) for argument in sys.argv[1:]]
+                raise ImportError("this command needs hydra-core; run: pip install 'hydra-core>=1.3,<1.4'") from error
+            sys.argv[1:] = _checked(sys.argv[1:], config_class)
             _import_tasks(sys.argv[1:])
             os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us instead of being printed over many lines
             for name, values in PRESETS.items():
                 ConfigStore.instance().store(group="preset", name=name, node=values.to_dict(), package="_global_")
-            _check_preset(sys.argv[1:])
 
             @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
             @one_line_errors  # inside as well: Hydra would add a line of its own to an exception that passes through it
             def run(values) -> None:
-                plain: Any = OmegaConf.to_container(values, resolve=True, throw_on_missing=True)
-                main(config_from_dict(config_class, plain))
+                try:
+                    plain: Any = OmegaConf.to_container(values, resolve=True, throw_on_missing=True)
+                except OmegaConfBaseException as error:  # ${...} in a value
+                    raise ValueError(f"{error.full_key} cannot be read: {first_line(error)}") from error
+                with console():
+                    main(config_from_dict(config_class, plain))
 
             run()
 
         return wrapped
 
     return decorate
+
+
+def _answer(arguments: list[str], config_class: type, what: str) -> str | None:
+    """What a question is answered with: ``--help``, ``--help planner``, ``task=list``."""
+    settings = settings_of(config_class)
+    if "task" in settings and "task=list" in arguments:
+        return list_tasks()
+    asked = {"--help", "-h", "help"} & set(arguments)
+    if not asked:
+        return None
+    topics, values = [], None
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if equals and name == "preset" and "preset" in settings:
+            values = _flat(preset(value).to_dict())
+        elif argument not in asked and not equals:
+            topic = argument.lstrip("-").removesuffix(".*").rstrip(".")
+            known = [*groups_of(config_class), *settings]
+            if topic not in known:
+                raise ValueError(f"there is no group and no setting {topic!r}; {_nearest(topic, known)}")
+            topics.append(topic)
+    return help_text(config_class, what, _command(), tuple(topics), values)
+
+
+def _command() -> str:
+    """The beginning of the command as it was typed."""
+    script = sys.argv[0]
+    return f"python {os.path.relpath(script)}" if script.endswith(".py") else os.path.basename(script)
+
+
+_FLAGS = {"--cfg", "-c", "--resolve", "--multirun", "-m"}
+_PATHS = {"run_dir", "checkpoint", "out", "video"}
+
+
+def _checked(arguments: list[str], config_class: type) -> list[str]:
+    """The arguments as Hydra takes them: names that exist, values that can be read, text in quotes.
+
+    Raises:
+        ValueError: naming what was typed, and what may have been meant.
+    """
+    settings, groups = settings_of(config_class), groups_of(config_class)
+    sweep = bool({"--multirun", "-m"} & set(arguments))
+    checked, rest = [], iter(arguments)
+    for argument in rest:
+        bare = argument.lstrip("-")
+        if argument in _FLAGS:
+            checked.append(argument)
+            if argument in ("--cfg", "-c"):
+                what = next(rest, "")
+                if what != "job":
+                    raise ValueError(f"{argument} must be followed by job, got {what!r}.")
+                checked.append(what)
+            continue
+        name, equals, value = bare.lstrip("+").partition("=")
+        if argument.startswith("-") and not (equals or bare in settings):
+            raise ValueError(f"unknown option {argument}; settings are written name=value, and --help lists them.")
+        if argument.startswith("~"):
+            raise ValueError(f"a setting cannot be removed, got {argument!r}; {name.lstrip('~')}=null may do.")
+        name = f"task.{name}" if f"task.{name}" in settings else name
+        if name.startswith("hydra.") and equals and sweep:  # of the sweeper or the launcher
+            checked.append(argument)
+            continue
+        if name in groups:
+            raise ValueError(
+                f"{name} is a group of settings; --help {name} lists them, e.g. {_first(name, settings)}=..."
+            )
+        if name not in settings:
+            raise ValueError(f"unknown setting {name}; {_nearest(name, settings)}")
+        if argument.startswith("-") or not equals:
+            raise ValueError(f"a setting is written name=value, without dashes or spaces, got {argument!r}.")
+        if name == "preset":
+            for preset_name in value.split(",") if sweep else [value]:
+                preset(preset_name)
+        if name in _PATHS and value.startswith("~"):
+            value = os.path.expanduser(value)
+        short = name.removeprefix("task.")
+        checked.append(f"{short}={value if sweep else _readable(settings[name], value)}")
+    given = {argument.partition("=")[0] for argument in checked}
+    for name, setting in settings.items():
+        if setting.default is dataclasses.MISSING and name not in given and "--cfg" not in given:
+            raise ValueError(f"{name}=... is missing: {setting.meaning[0].lower()}{setting.meaning[1:]}")
+    return checked
+
+
+def _readable(setting: Setting, value: str) -> str:
+    """A value as Hydra reads it: text in quotes, whatever is in it; anything else must be one word."""
+    quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+    if quoted or value in ("null", "None"):
+        return value.replace("None", "null") if not quoted else value
+    if setting.is_text and value:
+        # Hydra takes a backslash for itself where a quote or the end follows.
+        escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
+        return f"'{escaped}'"
+    if not value:
+        raise ValueError(f"{setting.name} must not be empty.")
+    if not re.fullmatch(r"[\w.+-]+", value):
+        kinds = {int: "a whole number", float: "a number", bool: "true or false"}
+        options = typing.get_args(setting.hint) or (setting.hint,)
+        kind = next((kinds[option] for option in options if option in kinds), "text")
+        kind = f"one of {', '.join(setting.choices)}" if setting.choices else kind
+        raise ValueError(f"{setting.name} must be {kind}, got {value!r}.")
+    return value
+
+
+def _first(group: str, settings: Iterable[str]) -> str:
+    return next(name for name in settings if name.startswith(f"{group}."))
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """A hint at names like this one: the same last part in another group counts too."""
+    known, last = list(known), name.rpartition(".")[2].lower()
+    same = [other for other in known if other.rpartition(".")[2] == last]
+    parts = {other.rpartition(".")[2]: other for other in known}
+    near = difflib.get_close_matches(name.lower(), known, n=2, cutoff=0.85)
+    near += [other for part in difflib.get_close_matches(last, parts, n=2, cutoff=0.75) for other in [parts[part]]]
+    found = list(dict.fromkeys([*same, *near]))[:3]
+    return f"did you mean {' or '.join(found)}? --help lists all." if found else "--help lists all."
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
 
 
 def explicit_settings(arguments: list[str] | None = None) -> list[str]:
@@ -99,13 +248,6 @@ def explicit_settings(arguments: list[str] | None = None) -> list[str]:
 _TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
 
 
-def _without_task_prefix(argument: str) -> str:
-    """``task.action_repeat=2`` as the setting ``action_repeat=2``: ``task`` itself is a name, not a group."""
-    name, equals, value = argument.partition("=")
-    group, _, setting = name.partition(".")
-    return f"{setting}{equals}{value}" if group == "task" and setting in _TASK_SETTINGS else argument
-
-
 def _import_tasks(arguments: list[str]) -> None:
     """Follows a task that is a path to code, ``task=package.module:function``.
 
@@ -113,6 +255,7 @@ def _import_tasks(arguments: list[str]) -> None:
     unless the command repeats it.
     """
     given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
+    given = {name: value.strip("'") for name, value in given.items()}
     settings = {}
     for name in _TASK_SETTINGS:
         try:
@@ -127,10 +270,3 @@ def _import_tasks(arguments: list[str]) -> None:
 
 
 _TRUTH = {"true": True, "false": False}
-
-
-def _check_preset(arguments: list[str]) -> None:
-    for argument in arguments:
-        if argument.startswith("preset="):
-            for name in argument.removeprefix("preset=").split(","):  # a sweep names several
-                preset(name)

@@ -55,14 +55,18 @@ class PlannerConfig:
     horizon: int = 6
     num_samples: int = 512
     num_elites: int = 64
+    """K, candidates to which the next Gaussian is fitted."""
     num_proposals: int = 24
     iterations: int = 6
+    """How often candidates are drawn and the Gaussian is fitted."""
     extra_iterations: int = 2
     large_action_dim: int = 20
+    """More dimensions than this count as many."""
     score: ScoreName = "mean"
     beta: float = 0.0
     inverse_temperature: float = 0.5
     std_min: float = 0.05
+    """Smallest standard deviation."""
     std_max: float = 2.0
     first_action: FirstAction = "elite"
     eval_first_action: FirstAction = "best"
@@ -95,10 +99,15 @@ class LossConfig:
     """Transitions per replayed slice."""
     rho: float = 0.5
     consistency_coef: float = 20.0
+    """Weight of predicting the next latent."""
     reward_coef: float = 0.1
+    """Weight of predicting the reward."""
     value_coef: float = 0.1
+    """Weight of the values' error."""
     termination_coef: float = 1.0
+    """Weight of predicting the end of an episode, where there is a termination head."""
     entropy_coef: float = 1e-4
+    """Weight of the policy's entropy."""
     kl_direction: KLDirection = "backward"
     tau: float = 0.01
     """Rate of the target values and of the running scale."""
@@ -126,6 +135,7 @@ class ReplayConfig:
     capacity: int = 1_000_000
     """Transitions; never more than the budget."""
     insertion: Insertion = "step"
+    """Whether a transition can be sampled at once or after its episode."""
     uniform_over: UniformOver = "episodes"
     device: Literal["auto", "cpu", "run"] = "auto"
     """Where the storage lives: ``cpu``; ``run``, the run's device; ``auto``, the run's device if the full buffer takes
@@ -141,10 +151,16 @@ class TrainConfig:
     """A whole run. Steps that users see are environment steps; one decision is ``action_repeat`` of them."""
 
     task: str = "walker-walk"
+    """A task of DMC, gym/ID for one of Gymnasium, or module:function for your own."""
     preset: str = "efficient-tdmpc"
+    """The values to begin with: efficient-tdmpc, efficient-tdmpc-utd2, efficient-tdmpc-utd4 and bmpc are for a GPU, cpu
+    learns on a CPU in minutes."""
     seed: int = 1
+    """Of all random numbers."""
     total_env_steps: int = 200_000
+    """The budget; steps of all environments count."""
     run_dir: str | None = None
+    """Where the run's files go. Default: runs/TASK/PRESET/seedSEED."""
     action_repeat: int | None = None
     """Environment steps per decision (``task.action_repeat`` on the command line). Default: the task's own."""
     episode_length: int | None = None
@@ -152,18 +168,26 @@ class TrainConfig:
     terminates: bool | None = None
     """Whether episodes can end before their time limit (``task.terminates``). Default: what is known of the task."""
     num_envs: int = 1
+    """Environments that step side by side, each in a process of its own."""
     overlap: bool = False
     """Whether updates come between planning and the simulator's step, so that a device computes while it steps; the
     sampled data is one decision older."""
     device: str = "auto"
+    """auto, cpu, cuda or cuda:N."""
     compile: Literal["auto", "off", "default", "max"] = "auto"
+    """``auto`` compiles planner and gradients where it can, which takes minutes the first time."""
     logger: LoggerName = "none"
+    """Where the numbers go besides the run's own files."""
     eval_every: int = 50_000
+    """Environment steps between two evaluations."""
     eval_episodes: int = 10
+    """Episodes of an evaluation."""
     eval_policy: bool = False
     """Whether evaluations also report the policy without the planner."""
     checkpoint_every: int = 50_000
+    """Environment steps between two checkpoints."""
     log_every: int = 1_000
+    """Environment steps between two rows of ``train.csv``."""
     checkpoint_minutes: float | None = 15.0
     """A checkpoint is also written when the last one is this old; ``null`` for never."""
     max_faults: int = 10
@@ -201,11 +225,16 @@ class TrainConfig:
         least_one |= {"optim.updates_per_decision": self.optim.updates_per_decision}
         for name, number in least_one.items():
             _require(number is None or number >= 1, f"{name} must be at least 1, got {number}.")
+        coefficients = {f"loss.{name}": value for name, value in vars(self.loss).items() if name.endswith("_coef")}
         for name, number in {
+            "replay.seed_decisions": self.seed_decisions,
             "replay.pretrain_updates": self.pretrain_updates,
             "reanalyze.every": self.reanalyze.every,
+            **coefficients,
         }.items():
             _require(number >= 0, f"{name} must not be negative, got {number}.")
+        for name, most in {"num_envs": 4096, "threads": 4096, "eval_episodes": 10_000}.items():  # each is one in memory
+            _require((getattr(self, name) or 0) <= most, f"{name} must be at most {most}, got {getattr(self, name)}.")
         self._check_against_the_episode(self.task_spec)
 
     def _check_against_the_episode(self, task: Task) -> None:
@@ -224,7 +253,7 @@ class TrainConfig:
         _require(
             self.total_env_steps > seed_env_steps,
             f"total_env_steps must exceed the random phase of {seed_env_steps} env steps, got {self.total_env_steps}; "
-            "raise the budget or lower replay.seed_decisions.",
+            f"raise the budget or lower replay.seed_decisions{' or task.episode_length' * bool(self.episode_length)}.",
         )
         _require(
             self.seed_decisions >= slice_len * self.num_envs,
@@ -356,13 +385,21 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
     if choices:
         _require(value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}.")
         return value
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        _require(abs(value) < _LARGEST_FLOAT, f"{name} must be a finite number below 1e30, got {value!r}.")
         return float(value)
+    if hint is int and isinstance(value, int | float) and not isinstance(value, bool):
+        _require(abs(value) < _LARGEST_INT, f"{name} must be a whole number below 2**53, got {value!r}.")
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)  # 2e5 is a natural way to write a budget
     if type(value) is not hint:
         raise ValueError(f"{name} must be of type {hint.__name__}, got {value!r}.")
     return value
+
+
+# What single precision holds with room for sums and squares of it, and what a float counts without a gap.
+_LARGEST_FLOAT = 1e30
+_LARGEST_INT = 2**53
 
 
 def _require(condition: bool, message: str) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torchrl import torchrl_logger
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.envs import make_env
@@ -17,6 +18,7 @@ from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logge
 from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.estimate import what_it_takes
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.train import TrainingRun
 
@@ -142,6 +144,8 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
                 run.resume()  # before anything of the run is changed: it may not be possible
             directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
             directory.write_config(config.to_dict())
+            what, takes = f"{config.task} with preset {config.preset}", what_it_takes(config, run.learner.agent.device)
+            torchrl_logger.info(f"{what}, {config.total_env_steps:,} env steps into {directory}: {takes}")
             return run.run()
         except BaseException:
             if plan.action == "begin" and not run.env_steps:

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from tensordict import TensorDictBase
-from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
@@ -19,9 +18,9 @@ from torchrl_etdmpc.training.builders import (
     build_reanalyze,
     build_replay,
     resolve_device,
-    row_bytes,
 )
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.memory import require_memory
 
 
 class Learner:
@@ -44,10 +43,9 @@ class Learner:
         self.config = config
         device = resolve_device(config.device)
         sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+        require_memory(config, *sizes, device)
         self.agent = build_agent(config, *sizes, device)
         self.replay = build_replay(config, device, sizes=sizes)
-        rows, where = self.replay.storage.max_size, getattr(self.replay.storage, "device", "cpu")
-        torchrl_logger.info(f"replay: {rows:,} rows, {rows * row_bytes(*sizes) / 1e6:,.0f} MB when full, on {where}")
         self.reanalyze = build_reanalyze(config, self.agent, self.replay)
         self.collector = build_collector(config, self.agent, env, self.replay)
         self.pretrained = self.faults = self.faults_in_a_row = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict
@@ -12,7 +12,7 @@ from torchrl import torchrl_logger
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_etdmpc.runs import first_line
+from torchrl_etdmpc.runs import first_line, progress_bar
 from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig
 
@@ -38,8 +38,11 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
     try:
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            for _ in range(calls):
-                _call_everything(config, agent, batch, eval_batch, device)
+            with progress_bar("compilation", 4 * calls, "parts") as progress:
+                for _ in range(calls):
+                    for call in _everything(config, agent, batch, eval_batch, device):
+                        call()
+                        progress.advance()
     except Exception as error:
         if config.compile != "auto":
             raise
@@ -50,9 +53,9 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     return seconds
 
 
-def _call_everything(
+def _everything(
     config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int], device: torch.device
-) -> None:
+) -> list[Callable[[], object]]:
     """One call of every compiled part, in the shapes of the run."""
     model = agent.world_model
 
@@ -65,17 +68,27 @@ def _call_everything(
         values = {"observation": zeros(*batch, model.observation_dim), "plan_mean": carried, "is_init": is_init}
         return TensorDict(values, batch)
 
-    with set_exploration_type(ExplorationType.RANDOM):
-        agent.planner(states(*batch))
+    def act() -> None:
+        with set_exploration_type(ExplorationType.RANDOM):
+            agent.planner(states(*batch))
+
+    def reanalyze() -> None:
         if config.reanalyze.every:
             rows = config.reanalyze.num_slices * config.loss.slice_len
-            agent.reanalyze_planner(states(rows).select("observation"))
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        agent.eval_planner(states(*eval_batch))
-    slices = config.optim.batch_size, config.loss.slice_len
-    action = zeros(*slices, model.action_dim)
-    following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
-    following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
-    rows = {"observation": following["observation"], "action": action, "next": following}
-    rows["plan"] = {"loc": action, "scale": action + 1}
-    agent.updater.warm_up(TensorDict(rows, slices))
+            with set_exploration_type(ExplorationType.RANDOM):
+                agent.reanalyze_planner(states(rows).select("observation"))
+
+    def evaluate() -> None:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            agent.eval_planner(states(*eval_batch))
+
+    def update() -> None:
+        slices = config.optim.batch_size, config.loss.slice_len
+        action = zeros(*slices, model.action_dim)
+        following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
+        following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
+        rows = {"observation": following["observation"], "action": action, "next": following}
+        rows["plan"] = {"loc": action, "scale": action + 1}
+        agent.updater.warm_up(TensorDict(rows, slices))
+
+    return [act, reanalyze, evaluate, update]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+import shutil
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
@@ -140,13 +140,12 @@ class TrainingRun:
             NonFiniteError, SimulatorError: if environment, policy or updates keep failing; the run is saved first.
         """
         try:
-            with progress_bar(self.config.total_env_steps, initial=self.env_steps) as progress:
-                self.precompile()
-                self.stop.nothing_to_save = False
-                self._do_what_is_due()
-                self._explore()
-                self._pretrain()
-                self._learn(progress)
+            self.precompile()
+            self.stop.nothing_to_save = False
+            self._do_what_is_due()
+            self._explore()
+            self._pretrain()
+            self._learn()
         except (NonFiniteError, SimulatorError):
             self.save()
             raise
@@ -175,34 +174,49 @@ class TrainingRun:
         self._compile_s = precompile(self.config, self.learner.agent, *batches)
 
     def _explore(self) -> None:
-        while self.state.stage == "random":
-            if not self.learner.collector.in_seed_phase:
-                self.state.stage = "pretrain"
-                return
-            self.learner.step()
-            self._after_work()
+        if self.state.stage != "random":
+            return
+        collector = self.learner.collector
+        total = self.config.seed_decisions
+        with progress_bar("random phase", total, "decisions", initial=collector.frames) as progress:
+            while collector.in_seed_phase:
+                self.learner.step()
+                self._after_work()
+                progress.update(collector.frames)
+        self.state.stage = "pretrain"
 
     def _pretrain(self) -> None:
         if self.state.stage != "pretrain":
             return
-        for _ in self.learner.pretrain():
-            self._after_work()
+        done = self.learner.pretrained
+        with progress_bar("pretraining", self.config.pretrain_updates, "updates", initial=done) as progress:
+            for _ in self.learner.pretrain():
+                self._after_work()
+                progress.update(self.learner.pretrained)
         self.state.stage = "learn"
         if self.config.seed_decisions and self.learner.passed(self.config.eval_every):
             self.state.due.append("evaluation")
         self._do_what_is_due()
 
-    def _learn(self, progress: ProgressBar) -> None:
+    def _learn(self) -> None:
         config, state = self.config, self.state
-        while self.env_steps < config.total_env_steps:
-            tick = time.perf_counter()
-            made = self.learner.step(updates=True)
-            state.learning_s += time.perf_counter() - tick
-            if made:
-                self._note_duties()
-            self._after_work()
-            latest = state.eval_returns[-1] if state.eval_returns else None
-            progress.update(env_steps=self.env_steps, decision_steps=self.learner.collector.frames, last_return=latest)
+        with progress_bar("learning", config.total_env_steps, "env steps", initial=self.env_steps) as progress:
+            while self.env_steps < config.total_env_steps:
+                tick = time.perf_counter()
+                made = self.learner.step(updates=True)
+                state.learning_s += time.perf_counter() - tick
+                if made:
+                    self._note_duties()
+                self._after_work()
+                progress.update(self.env_steps, self._note())
+
+    def _note(self) -> str:
+        """What the bar says besides its steps; a narrow terminal has no room for the speed."""
+        state, learned = self.state, self.learner.collector.frames - self.config.seed_decisions
+        parts = [f"return {state.eval_returns[-1]:.1f}"] if state.eval_returns else []
+        if state.learning_s and shutil.get_terminal_size().columns >= 100:
+            parts.append(f"{learned / state.learning_s:.1f} decisions/s")
+        return ", ".join(parts)
 
     def _note_duties(self) -> None:
         config, last = self.config, self.env_steps >= self.config.total_env_steps
@@ -243,8 +257,11 @@ class TrainingRun:
 
     def evaluate(self) -> None:
         """Appends a row to ``eval.csv``."""
+        rounds = -(-self.config.eval_episodes // max(self.evaluator.env.batch_size.numel(), 1))
+        steps = self.config.task_spec.decision_steps_per_episode * rounds * (1 + self.config.eval_policy)
         try:
-            result = self.evaluator(on_step=self._leave_evaluation)
+            with progress_bar("evaluation", steps, "decisions", passing=True) as progress:
+                result = self.evaluator(on_step=lambda _: self._on_evaluation_step(progress))
         except _EvaluationLeftError:
             self._stop_if_asked()  # with training's random numbers; the evaluation is repeated from its beginning
             return
@@ -263,7 +280,8 @@ class TrainingRun:
             del row["policy_return"]
         self.log.log_eval(row, **self.counters())
 
-    def _leave_evaluation(self, _: TensorDictBase) -> None:
+    def _on_evaluation_step(self, progress: ProgressBar) -> None:
+        progress.advance()
         if self.stop.requested:
             raise _EvaluationLeftError
 

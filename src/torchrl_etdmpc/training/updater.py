@@ -75,7 +75,8 @@ class Updater:
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
-        SoftUpdate(loss, tau=tau)  # tells the loss that its targets follow
+        # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
+        SoftUpdate(loss, tau=min(tau, 0.5))
         self.parts = _parts(loss)
         self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         values = dict(loss.value_params.flatten_keys(".").items())

@@ -1,0 +1,86 @@
+"""The commands ``torchrl-etdmpc train|evaluate|export|report``; the scripts in ``examples/`` run the same ones."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+import threading
+from types import FrameType
+
+__all__ = ["main"]
+
+_COMMANDS = {
+    "train": "trains an agent on any task",
+    "evaluate": "plays episodes with a trained agent, and films them",
+    "export": "writes an agent as programs that need PyTorch only",
+    "report": "compares runs with each other and with published baselines",
+}
+
+
+def main(command: str | None = None) -> None:
+    """Runs one command with the arguments of this process.
+
+    It is here before PyTorch, whose import takes seconds: Ctrl-C in the meantime ends in one line, and MuJoCo, which
+    looks for a renderer when it is imported, is told whether there will be anything to render.
+
+    Args:
+        command (str, optional): ``"train"``, ``"train_dmc"``, ``"evaluate"``, ``"export"`` or ``"report"``. Default:
+            the first argument.
+    """
+    if command is None:
+        command = _first_argument()
+    _choose_renderer(command, sys.argv[1:])
+    handler = signal.getsignal(signal.SIGINT)
+    quiet = handler is signal.default_int_handler and threading.current_thread() is threading.main_thread()
+    if quiet:
+        signal.signal(signal.SIGINT, _leave)
+    try:
+        module = importlib.import_module(f"{__name__}.{command}")
+    except Exception as error:  # MuJoCo's import fails in a dozen ways where a renderer is missing
+        backend = os.environ["MUJOCO_GL"]
+        if backend == "disable" or os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
+            raise
+        reason = " ".join(str(error).split())
+        sys.exit(f"error: cannot render with MUJOCO_GL={backend} ({reason}); try MUJOCO_GL=egl, or leave the film out.")
+    finally:
+        if quiet:
+            signal.signal(signal.SIGINT, handler)
+    module.main()
+
+
+def _first_argument() -> str:
+    lines = "".join(f"  {name:9} {meaning}\n" for name, meaning in _COMMANDS.items())
+    usage = (
+        f"usage: torchrl-etdmpc COMMAND ...\n\n{lines}\n"
+        "torchrl-etdmpc COMMAND --help says what a command takes, torchrl-etdmpc --version which version this is."
+    )
+    given = sys.argv[1] if len(sys.argv) > 1 else ""
+    if given in ("--help", "-h", "help", ""):
+        print(usage)
+        sys.exit(0 if given else 2)
+    if given == "--version":
+        from torchrl_etdmpc import __version__
+
+        print(f"torchrl-etdmpc {__version__}")
+        sys.exit(0)
+    if given not in _COMMANDS:
+        sys.exit(f"error: unknown command {given!r}; choose one of {', '.join(_COMMANDS)}.")
+    sys.argv[:2] = [f"torchrl-etdmpc {given}"]
+    return given
+
+
+def _choose_renderer(command: str, arguments: list[str]) -> None:
+    given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
+    if command == "evaluate" and given.get("video", "null") != "null":
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    elif ":" not in given.get("task", ""):  # a task of the user's own may render inside
+        os.environ["MUJOCO_GL"] = "disable"  # whatever it was: without a film, a missing renderer need not hurt
+    else:
+        os.environ.setdefault("MUJOCO_GL", "disable")
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"\nstopped before anything was begun\n")
+    os._exit(128 + number)

@@ -1,0 +1,112 @@
+"""``evaluate``: returns of whole episodes with the planner or with the bare policy, and a film if asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.commands.train import CONFIG
+from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame
+from torchrl_etdmpc.planners import BarePolicy
+from torchrl_etdmpc.runs import write_film
+from torchrl_etdmpc.training import TrainConfig, hydra_main, load_agent, read_agent_file, resolve_device
+
+GIF_SIZE = 200  # pixels, for a page
+FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """What to evaluate."""
+
+    checkpoint: str
+    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
+    episodes: int = 10
+    """How many are played, side by side unless there is a film."""
+    policy: Literal["planner", "bare"] = "planner"
+    """``bare`` is the policy network without the planner."""
+    video: str | None = None
+    """A file that ends in .mp4 or .gif, for a film of the first episode."""
+    task: str | None = None
+    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
+    action_repeat: int | None = None
+    """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
+    episode_length: int | None = None
+    """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
+    terminates: bool | None = None
+    """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
+    seed: int = 0
+    """Of the initial states and the planner's samples."""
+    device: str = "auto"
+    """``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1, got {self.episodes}.")
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"seed must be in [0, 2**32 - 1], got {self.seed}.")
+        if self.video is not None and Path(self.video).suffix not in (".mp4", ".gif"):
+            raise ValueError(f"video must end in .mp4 or .gif, got {self.video!r}.")
+
+
+def task_of(config: EvaluateConfig) -> Task:
+    """The task that the command names, or the one that the agent was trained on, with what its run changed about it."""
+    changes = {name: getattr(config, name) for name in ("action_repeat", "episode_length", "terminates")}
+    told = {name: value for name, value in changes.items() if value is not None}
+    stored = read_agent_file(config.checkpoint)["config"]
+    if config.task is not None and config.task != stored["task"]:
+        return get_task(config.task, **told)
+    return dataclasses.replace(TrainConfig.from_dict(stored).task_spec, **told)
+
+
+@hydra_main(CONFIG, "evaluate", EvaluateConfig)
+def main(config: EvaluateConfig) -> None:
+    """Plays episodes with a trained agent, and films the first one if asked to."""
+    device = resolve_device(config.device)
+    task = task_of(config)
+    # A film needs the one environment that it shows; otherwise the episodes run side by side.
+    env = make_env(task, seed=config.seed, num_envs=1 if config.video else config.episodes, parallel=False)
+    agent, _, counters = load_agent(
+        config.checkpoint,
+        observation_dim=env.observation_spec["observation"].shape[-1],
+        action_dim=env.action_spec.shape[-1],
+        device=device,
+        compile_setting="off",
+    )
+    torch.manual_seed(config.seed)
+    if config.policy == "planner":
+        policy = agent.eval_planner
+        env = env.append_transform(policy.make_tensordict_primer())
+    else:
+        policy = BarePolicy(agent.world_model)
+
+    size = (GIF_SIZE, GIF_SIZE) if str(config.video).endswith(".gif") else ()
+    frames: list[torch.Tensor] = []
+    ended = False
+
+    def film(step: TensorDictBase) -> None:
+        nonlocal ended
+        if not ended:
+            frames.append(render_frame(env, *size))
+            ended = bool(step["next", "done"].any())
+
+    if config.video:
+        env.reset()
+        render_frame(env, *size)  # fails here, before the episodes, if this machine cannot render
+    returns = evaluate(
+        env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
+    )
+    if config.video:
+        write_film(frames, config.video, fps=FRAMES_PER_SECOND)
+    env.close(raise_if_closed=False)
+    spread = returns.std(correction=0).item()
+    print(
+        f"{task.name} ({config.policy}, trained for {counters['env_steps']} env steps): return {returns.mean():.1f} "
+        f"+- {spread:.1f} over {len(returns)} episodes" + (f"; film in {config.video}" if config.video else "")
+    )

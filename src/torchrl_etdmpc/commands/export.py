@@ -1,0 +1,67 @@
+"""``export``: an agent's policy and planner as ``torch.export`` programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchrl_etdmpc.commands.train import CONFIG
+from torchrl_etdmpc.planners import export_planner, export_policy
+from torchrl_etdmpc.runs import replacing
+from torchrl_etdmpc.training import hydra_main, load_agent
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """What to export."""
+
+    checkpoint: str
+    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
+    out: str = "exported"
+    """Folder for policy.pt2 and planner.pt2."""
+    batch_size: int = 1
+    """States per call of the planner; the policy takes any number."""
+    task: str | None = None
+    """A task of your own, ``module:function``, must be named as it was to train on it."""
+    action_repeat: int | None = None
+    """``task.action_repeat`` on the command line; with a task of your own, what it was trained with."""
+    episode_length: int | None = None
+    """``task.episode_length``; likewise."""
+    terminates: bool | None = None
+    """``task.terminates``; likewise."""
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1, got {self.batch_size}.")
+
+
+@hydra_main(CONFIG, "export", ExportConfig)
+def main(config: ExportConfig) -> None:
+    """Writes an agent's policy and planner as programs that run where only PyTorch is installed."""
+    agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
+    if config.task not in (None, run.task):
+        raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
+    model = agent.world_model
+    policy = export_policy(model)
+    planner = export_planner(agent.eval_planner, batch_size=config.batch_size)
+    horizon = agent.eval_planner.horizon
+    observation = torch.randn(config.batch_size, model.observation_dim)
+    plan_mean = torch.zeros(config.batch_size, horizon, model.action_dim)
+    with torch.no_grad():
+        torch.testing.assert_close(policy.module()(observation), model.policy(model.encode(observation))[0])
+        actions = []
+        for plan in (planner.module(), lambda *inputs: agent.eval_planner.plan(*inputs, explore=False)):
+            torch.manual_seed(0)
+            actions.append(plan(observation, plan_mean)[0])
+        torch.testing.assert_close(*actions)
+    out = Path(config.out).expanduser()
+    out.mkdir(parents=True, exist_ok=True)
+    for name, program in (("policy", policy), ("planner", planner)):
+        with replacing(out / f"{name}.pt2") as partial:
+            torch.export.save(program, partial)
+    print(
+        f"{run.task}: {out}/policy.pt2 and {out}/planner.pt2, observations {list(observation.shape)}, actions "
+        f"{list(actions[0].shape)}, plan_mean {list(plan_mean.shape)}"
+    )

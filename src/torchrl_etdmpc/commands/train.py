@@ -1,0 +1,33 @@
+"""``train``: any task, from an empty directory, or from where a run was stopped, to its summary."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from torchrl_etdmpc.training import (
+    EXIT_CODE,
+    RunInterrupted,
+    TrainConfig,
+    as_typed,
+    explicit_settings,
+    hydra_main,
+    launch,
+)
+
+CONFIG = str(Path(__file__).parent / "config")
+
+
+@hydra_main(CONFIG, "train")
+def main(config: TrainConfig) -> None:
+    """Trains EfficientTDMPC on any task: DMC's, Gymnasium's, or an environment of your own."""
+    train(config)
+
+
+def train(config: TrainConfig) -> None:
+    """One run, with one closing line on what came out."""
+    try:
+        print(launch(config, explicit_settings()))
+    except RunInterrupted as stop:
+        print(as_typed(str(stop)))
+        sys.exit(EXIT_CODE)

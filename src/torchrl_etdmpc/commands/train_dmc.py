@@ -1,0 +1,15 @@
+"""``train``, restricted to the DMC tasks of the benchmarks."""
+
+from __future__ import annotations
+
+from torchrl_etdmpc.commands.train import CONFIG, train
+from torchrl_etdmpc.envs import DMC_TASKS
+from torchrl_etdmpc.training import TrainConfig, hydra_main
+
+
+@hydra_main(CONFIG, "train")
+def main(config: TrainConfig) -> None:
+    """Trains EfficientTDMPC on one of the 28 DeepMind Control tasks of the benchmarks; train.py takes any task."""
+    if config.task not in DMC_TASKS:
+        raise ValueError(f"train_dmc.py knows the 28 DMC tasks, not {config.task!r}; use examples/train.py.")
+    train(config)

@@ -1,0 +1,100 @@
+"""How long a run will take on a CPU, from the arithmetic of its settings and a moment of this machine's speed."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+
+from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig
+
+# What a decision costs beside arithmetic (simulator, collector, buffer), and an update; measured with the cpu preset.
+_DECISION_S, _UPDATE_S = 0.003, 0.003
+_SHARE_OF_SPEED = 0.6  # what planning and learning reach of the speed of their largest matrix products
+_ACTION_DIM = 6  # of walker; another one makes no difference here
+
+
+def decision_flops(config: TrainConfig) -> tuple[float, float]:
+    """Floating-point operations of one plan, and of what else a decision calls for: updates and reanalyze.
+
+    >>> plan, rest = decision_flops(TrainConfig())
+    >>> 1e11 < plan < 1e12
+    True
+    """
+    model, loss, optim, again = config.model, config.loss, config.optim, config.reanalyze
+    plan = _plan_flops(model, config.planner)
+    rows = optim.batch_size * loss.slice_len
+    update = 3 * rows * (model.num_dynamics * (_step_flops(model) + _value_flops(model)) + _value_flops(model))
+    reanalyzed = again.num_slices * loss.slice_len * _plan_flops(model, again) / again.every if again.every else 0.0
+    return plan, (optim.updates_per_decision * update + reanalyzed)
+
+
+def estimated_seconds(config: TrainConfig) -> float:
+    """Seconds of the whole run on the CPU, without compilation; right within a factor of two or three."""
+    plan, rest = decision_flops(config)
+    speed = _SHARE_OF_SPEED * _flops_per_second(config)
+    repeat = config.task_spec.action_repeat
+    learning = max(config.total_env_steps / repeat - config.seed_decisions, 0)
+    evaluations = config.total_env_steps // config.eval_every + 1
+    played = evaluations * config.eval_episodes * config.task_spec.decision_steps_per_episode
+    update_s = _UPDATE_S * config.optim.updates_per_decision + rest / speed
+    return (
+        learning * (_DECISION_S + plan / speed + update_s)
+        + config.pretrain_updates * update_s
+        + played * (_DECISION_S / 3 + plan / speed)
+    )
+
+
+def what_it_takes(config: TrainConfig, device: torch.device) -> str:
+    """How long the run will take on this machine, and what to do about it if that is long."""
+    if device.type == "cuda":
+        return f"on {torch.cuda.get_device_name(device)}"
+    seconds = estimated_seconds(config)
+    compiled = "" if config.compile == "off" else ", and before it some minutes to compile the first time"
+    line = f"about {_duration(seconds)} on this CPU{compiled}"
+    if config.preset != "cpu" and seconds > 3600:
+        line += f"; preset={config.preset} is made for a GPU and there is none here: preset=cpu learns in minutes"
+    return line
+
+
+def _duration(seconds: float) -> str:
+    """A time in words, rounded as an estimate is.
+
+    >>> _duration(40), _duration(400), _duration(20_000), _duration(2_000_000)
+    ('1 minute', '7 minutes', '6 hours', '23 days')
+    """
+    for unit, length in (("day", 86_400), ("hour", 3_600)):
+        if seconds >= 1.5 * length:
+            return f"{seconds / length:.0f} {unit}s"
+    minutes = max(round(seconds / 60), 1)
+    return f"{minutes} minute{'s' * (minutes > 1)}"
+
+
+def _plan_flops(model: ModelConfig, planner: PlannerConfig) -> float:
+    depths = 1 if planner.score == "final" else planner.horizon
+    path = planner.horizon * _step_flops(model) + depths * model.num_values * _value_flops(model)
+    candidates = planner.iterations * (planner.num_samples - planner.num_proposals) + planner.num_proposals
+    return float(model.num_dynamics) * candidates * path
+
+
+def _step_flops(model: ModelConfig) -> float:
+    """The next latent and the reward of one row, by one head."""
+    first, middle = model.latent_dim + _ACTION_DIM, model.mlp_dim
+    return 2.0 * middle * (2 * first + 2 * middle + model.latent_dim + model.num_bins)
+
+
+def _value_flops(model: ModelConfig) -> float:
+    """One value head on one row."""
+    return 2.0 * model.mlp_dim * (model.latent_dim + model.mlp_dim + model.num_bins)
+
+
+def _flops_per_second(config: TrainConfig) -> float:
+    """Of matrix products such as the planner's, on this machine and now."""
+    rows = min(config.planner.num_samples * config.model.num_dynamics, 2048)
+    left, right = torch.ones(rows, config.model.mlp_dim), torch.ones(config.model.mlp_dim, config.model.mlp_dim)
+    products, began = 0, time.perf_counter()
+    while products < 3 or time.perf_counter() - began < 0.02:
+        left @ right
+        products += 1
+    seconds = time.perf_counter() - began
+    return 2.0 * rows * config.model.mlp_dim**2 * products / seconds

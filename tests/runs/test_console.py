@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import re
+import sys
+import warnings
+
+from torchrl import torchrl_logger
+
+from torchrl_etdmpc.runs import console
+
+
+def test_the_log_is_plain_lines_with_the_time(capsys):
+    with console():
+        torchrl_logger.warning("a word of warning")
+    out, err = capsys.readouterr()
+    assert re.fullmatch(r"\d\d:\d\d:\d\d a word of warning\n", out)
+    assert err == ""
+
+
+def test_notices_of_other_libraries_are_left_out_and_their_warnings_are_not(capsys):
+    notice = torchrl_logger.makeRecord("torchrl", 20, "/site-packages/torchrl/storages.py", 1, "made one", (), None)
+    warning = torchrl_logger.makeRecord("torchrl", 30, "/site-packages/torchrl/storages.py", 1, "look out", (), None)
+    with console():
+        torchrl_logger.handle(notice)
+        torchrl_logger.handle(warning)
+    assert capsys.readouterr().out.endswith("look out\n")
+
+
+def test_a_warning_has_no_source_line(capsys):
+    with warnings.catch_warnings(), console():
+        warnings.simplefilter("always")
+        warnings.warn("no checkpoint at 40 env steps", stacklevel=1)
+    out, err = capsys.readouterr()
+    assert re.fullmatch(r"\d\d:\d\d:\d\d warning: no checkpoint at 40 env steps\n", err)
+    assert out == ""
+
+
+def test_what_was_there_before_comes_back(capsys):
+    handlers, show = torchrl_logger.handlers, warnings.showwarning
+    with console():
+        pass
+    assert torchrl_logger.handlers is handlers
+    assert warnings.showwarning is show
+
+
+def test_without_tqdm_there_are_lines_too(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    with console():
+        torchrl_logger.warning("a word")
+    assert capsys.readouterr().out.endswith(" a word\n")

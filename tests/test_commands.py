@@ -1,0 +1,135 @@
+"""The command of the wheel: what it says before anything heavy is imported, and that the wheel has all it needs."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from torchrl_etdmpc import __version__, commands
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def run_command(monkeypatch, capsys):
+    """Runs ``torchrl-etdmpc`` in this process; returns its exit message, stdout and stderr."""
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+
+    def run(*arguments: str) -> tuple[object, str, str]:
+        monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", *arguments])
+        message = None
+        try:
+            commands.main()
+        except SystemExit as stop:
+            message = stop.code
+        return message, *capsys.readouterr()
+
+    return run
+
+
+def test_the_wheel_s_command_is_the_examples_code():
+    assert PROJECT["project"]["scripts"] == {"torchrl-etdmpc": "torchrl_etdmpc.commands:main"}
+    for script in (ROOT / "examples").glob("*.py"):
+        assert f'main("{script.stem}")' in script.read_text(encoding="utf-8")
+
+
+def test_the_wheel_holds_every_file_that_the_package_reads():
+    package = ROOT / "src" / "torchrl_etdmpc"
+    patterns = PROJECT["tool"]["setuptools"]["package-data"]["torchrl_etdmpc"]
+    files = [path.relative_to(package).as_posix() for path in package.rglob("*") if path.is_file()]
+    data = [file for file in files if not file.endswith((".py", ".pyc"))]
+    assert {"py.typed", "commands/config/train.yaml", "analysis/reference/bmpc.csv"} <= set(data)
+    assert [file for file in data if not any(fnmatch.fnmatch(file, pattern) for pattern in patterns)] == []
+
+
+def test_the_sdist_holds_the_checkout():
+    listing = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listing.returncode:
+        pytest.skip("not in a checkout")
+    tops = {line.split("/")[0] for line in listing.stdout.splitlines()} - {".gitignore"}
+    manifest = (ROOT / "MANIFEST.in").read_text(encoding="utf-8").split()
+    assert tops - set(manifest) <= {"MANIFEST.in", "pyproject.toml"}  # these two are always there
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "export", "report"])
+def test_every_command_has_a_help_that_says_what_it_takes(run_command, name):
+    message, out, err = run_command(name, "--help")
+    assert message in (None, 0)
+    assert err == ""
+    assert f"usage: torchrl-etdmpc {name} " in out
+    assert max(map(len, out.splitlines())) <= 100
+
+
+def test_without_a_command_the_commands_are_listed(run_command):
+    for arguments in ((), ("--help",)):
+        message, out, _ = run_command(*arguments)
+        assert message == (0 if arguments else 2)
+        assert all(name in out for name in ("train", "evaluate", "export", "report"))
+    assert run_command("--version") == (0, f"torchrl-etdmpc {__version__}\n", "")
+    assert run_command("tran")[0] == "error: unknown command 'tran'; choose one of train, evaluate, export, report."
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "before", "after"),
+    [
+        ("train", ["task=walker-walk"], "nonsense", "disable"),
+        ("evaluate", ["checkpoint=a.pt"], "osmesa", "disable"),
+        ("evaluate", ["checkpoint=a.pt", "video=a.mp4"], "osmesa", "osmesa"),
+        ("evaluate", ["checkpoint=a.pt", "video=a.mp4"], None, "egl"),
+        ("train", ["task=mine:make"], "egl", "egl"),
+        ("train", ["task=mine:make"], None, "disable"),
+        ("report", ["runs"], "nonsense", "disable"),
+    ],
+)
+def test_a_renderer_is_asked_for_only_where_something_may_be_rendered(monkeypatch, command, arguments, before, after):
+    if before is None:
+        monkeypatch.delenv("MUJOCO_GL", raising=False)
+    else:
+        monkeypatch.setenv("MUJOCO_GL", before)
+    commands._choose_renderer(command, arguments)
+    assert os.environ["MUJOCO_GL"] == after
+
+
+def start(*arguments: str, **variables: str) -> subprocess.Popen[str]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1", **variables}
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # also where this process ignores it
+    try:
+        return subprocess.Popen(
+            [sys.executable, str(ROOT / "examples" / "train.py"), *arguments],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def test_a_missing_renderer_does_not_hurt_a_run_that_renders_nothing(tmp_path):
+    process = start("task=cartpole-balance", "preset=cpu", "total_env_steps=1", MUJOCO_GL="nonsense")
+    _, err = process.communicate(timeout=300)
+    assert err.startswith("error: total_env_steps must exceed the random phase")  # it came as far as the settings
+
+
+@pytest.mark.parametrize("delay", [0.15, 0.6, 1.5])
+def test_ctrl_c_while_pytorch_is_imported_is_one_line(delay):
+    process = start("task=walker-walk", "preset=cpu", "total_env_steps=1")
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=300)
+    if process.returncode == 1 and err.startswith("error: total_env_steps"):
+        pytest.skip("the machine was too fast")
+    assert out == ""
+    assert "Traceback" not in err or delay < 0.3  # Python itself may still be starting
+    if delay > 0.3:
+        assert (process.returncode, err) == (130, "\nstopped before anything was begun\n")
