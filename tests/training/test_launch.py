@@ -27,6 +27,7 @@ from torchrl_etdmpc.training import (
     read_run_config,
     resumed_config,
     save_agent,
+    with_stored_settings,
 )
 
 EPISODE = 20  # decisions
@@ -167,6 +168,24 @@ def test_a_command_may_repeat_a_setting_of_the_run_but_not_change_it(command):
         "planner.horizon=3 was asked for, but this run was started with planner.horizon=2; leave it out to go on, or "
         "start a new run_dir."
     )
+
+
+def test_settings_that_a_command_does_not_name_are_the_run_s_before_anything_is_checked(command):
+    directory = begin(command())
+    save(directory)
+    typed = {"run_dir": str(directory), "total_env_steps": 200, "resume": True, "replay": {"seed_decisions": 5000}}
+    values = TrainConfig.from_dict({**command().to_dict(), "task": "walker-walk", "total_env_steps": 50_000}).to_dict()
+    completed = with_stored_settings(values | typed, ["run_dir", "total_env_steps", "resume"])
+    assert TrainConfig.from_dict(completed) == command(total_env_steps=200, resume="on")
+    with pytest.raises(ValueError, match=r"^replay\.seed_decisions=5000 was asked for, but this run was started with"):
+        with_stored_settings(values | typed, ["run_dir", "resume", "replay.seed_decisions"])
+    with pytest.raises(
+        ValueError, match=r"^task\.action_repeat=3 was asked for, .* started with task\.action_rep"
+    ):
+        with_stored_settings(values | typed | {"action_repeat": 3}, ["action_repeat"])
+    for resume in (False, "off"):
+        assert with_stored_settings(values | typed | {"resume": resume}, ["run_dir"])["task"] == "walker-walk"
+    assert with_stored_settings(values | {"resume": "auto", "run_dir": "nowhere"})["run_dir"] == "nowhere"
 
 
 def test_a_changed_setting_is_checked_with_the_others(command):

@@ -13,12 +13,13 @@ from torchrl_etdmpc.training import (
     explicit_settings,
     hydra_main,
     launch,
+    with_stored_settings,
 )
 
 CONFIG = str(Path(__file__).parent / "config")
 
 
-@hydra_main(CONFIG, "train")
+@hydra_main(CONFIG, "train", complete=with_stored_settings)
 def main(config: TrainConfig) -> None:
     """Trains EfficientTDMPC on any task: DMC's, Gymnasium's, or an environment of your own."""
     train(config)

@@ -14,7 +14,14 @@ from torchrl_etdmpc.training.command_line import as_typed, explicit_settings, hy
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.estimate import estimated_seconds, what_it_takes
 from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
-from torchrl_etdmpc.training.launch import Launch, launch, plan_launch, read_run_config, resumed_config
+from torchrl_etdmpc.training.launch import (
+    Launch,
+    launch,
+    plan_launch,
+    read_run_config,
+    resumed_config,
+    with_stored_settings,
+)
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.signals import EXIT_CODE, RunInterrupted
@@ -58,4 +65,5 @@ __all__ = [
     "row_bytes",
     "save_agent",
     "what_it_takes",
+    "with_stored_settings",
 ]

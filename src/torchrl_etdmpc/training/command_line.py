@@ -14,7 +14,7 @@ from typing import Any
 
 from torchrl_etdmpc.envs import import_task, list_tasks
 from torchrl_etdmpc.runs import console, first_line
-from torchrl_etdmpc.training.config import TrainConfig, config_from_dict
+from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig, config_from_dict
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.settings_help import Setting, groups_of, help_text, settings_of
 
@@ -56,7 +56,11 @@ def as_typed(text: str) -> str:
 
 
 def hydra_main(
-    config_path: str, config_name: str, config_class: type = TrainConfig
+    config_path: str,
+    config_name: str,
+    config_class: type = TrainConfig,
+    *,
+    complete: Callable[[dict[str, Any], list[str]], dict[str, Any]] | None = None,
 ) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
     """Decorates ``main(config)`` with a command line: settings as Hydra's overrides, presets, ``--help``.
 
@@ -67,6 +71,10 @@ def hydra_main(
         config_path (str): absolute folder of the YAML files.
         config_name (str): the file, without its ending.
         config_class (type): dataclass that ``main`` receives, checked. Default: :class:`TrainConfig`.
+
+    Keyword Args:
+        complete (callable, optional): gets all settings and the names of those that were typed, and returns those
+            that are checked, e.g. :func:`~torchrl_etdmpc.training.with_stored_settings`.
 
     Raises:
         ImportError: on the call, if hydra-core is missing.
@@ -101,7 +109,8 @@ def hydra_main(
                 except OmegaConfBaseException as error:  # ${...} in a value
                     raise ValueError(f"{error.full_key} cannot be read: {first_line(error)}") from error
                 with console():
-                    main(config_from_dict(config_class, plain))
+                    completed = plain if complete is None else complete(plain, explicit_settings())
+                    main(config_from_dict(config_class, completed))
 
             run()
 
@@ -245,9 +254,6 @@ def explicit_settings(arguments: list[str] | None = None) -> list[str]:
     return [name for name in names if not name.startswith(("hydra", "-", "~"))]
 
 
-_TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
-
-
 def _import_tasks(arguments: list[str]) -> None:
     """Follows a task that is a path to code, ``task=package.module:function``.
 
@@ -257,7 +263,7 @@ def _import_tasks(arguments: list[str]) -> None:
     given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
     given = {name: value.strip("'") for name, value in given.items()}
     settings = {}
-    for name in _TASK_SETTINGS:
+    for name in TASK_SETTINGS:
         try:
             if name in given and given[name] != "null":
                 settings[name] = _TRUTH[given[name].lower()] if name == "terminates" else int(float(given[name]))

@@ -24,6 +24,9 @@ from torchrl_etdmpc.planners.scores import ScoreName
 from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
 
+TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
+"""Written as ``task.action_repeat`` etc. on the command line; ``task`` itself is a name, not a group."""
+
 
 @dataclass(frozen=True)
 class ModelConfig:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
 from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
-from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 from torchrl_etdmpc.training.estimate import what_it_takes
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.train import TrainingRun
@@ -65,8 +65,7 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
             checkpoint to go on from.
         ValueError: if the command names a setting with another value than the run's, and it may not change.
     """
-    name = config.task.replace(":", ".")
-    directory = RunDirectory(config.run_dir or Path("runs", name, config.preset, f"seed{config.seed}"))
+    directory = _directory(config.to_dict())
     there = directory.config.exists() or directory.last_agent.exists()
     if directory.leftover or config.resume == "off" or (config.resume == "auto" and not there):
         directory.require_new()
@@ -174,34 +173,66 @@ def read_run_config(directory: RunDirectory) -> TrainConfig:
         raise ValueError(f"{directory.config} cannot be used: {error}") from error
 
 
-def resumed_config(saved: TrainConfig, asked: TrainConfig, explicit: Iterable[str]) -> TrainConfig:
+def with_stored_settings(values: Mapping[str, Any], explicit: Iterable[str] = ()) -> dict[str, Any]:
+    """The settings of a command that goes on with a run: what it does not name is the run's, not the preset's.
+
+    Args:
+        values (mapping): the command's settings, not checked yet.
+        explicit (iterable of str): those that it names.
+
+    Returns:
+        dict: ``values``, if no run is to go on.
+
+    Raises:
+        ValueError: as :func:`resumed_config` does.
+    """
+    directory, resume = _directory(values), values.get("resume", "off")
+    there = directory.config.exists() or directory.last_agent.exists()
+    if resume in (False, "off", "false") or directory.leftover or not there:
+        return dict(values)
+    return resumed_config(read_run_config(directory), values, explicit).to_dict()
+
+
+def _directory(values: Mapping[str, Any]) -> RunDirectory:
+    task = str(values.get("task")).replace(":", ".")
+    default = Path("runs", task, str(values.get("preset")), f"seed{values.get('seed')}")
+    return RunDirectory(values.get("run_dir") or default)
+
+
+def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], explicit: Iterable[str]) -> TrainConfig:
     """The saved configuration with the settings that may change.
 
     Args:
         saved (TrainConfig): of the run directory.
-        asked (TrainConfig): of this command.
+        asked (TrainConfig or mapping): of this command.
         explicit (iterable of str): settings that the command names, e.g. ``planner.horizon``; the others are taken
             from the run.
 
     Raises:
         ValueError: if the command names a setting with another value than the run's, and it may not change.
     """
-    values, wanted = _flat(saved.to_dict()), _flat(asked.to_dict())
+    values = _flat(saved.to_dict())
+    wanted = _flat(asked.to_dict() if isinstance(asked, TrainConfig) else asked)
     for name in explicit:
         if name in CHANGEABLE:
             values[name] = wanted[name]
-        elif values[name] != wanted[name]:
+        elif values.get(name) != wanted.get(name):
             raise ValueError(
-                f"{name}={wanted[name]} was asked for, but this run was started with {name}={values[name]}; leave it "
-                "out to go on, or start a new run_dir."
+                f"{_typed(name)}={wanted.get(name)} was asked for, but this run was started with "
+                f"{_typed(name)}={values.get(name)}; leave it out to go on, or start a new run_dir."
             )
     return TrainConfig.from_dict(_nested(values))
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _typed(name: str) -> str:
+    """A setting as it is written on the command line."""
+    return f"task.{name}" if name in TASK_SETTINGS else name
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return flat
 
 
