@@ -1,0 +1,303 @@
+"""Kills, signals and flipped bits: a run ends as if nothing had happened, or says in one line what is wrong.
+
+    python benchmarks/faults.py kills --number 300   # real processes, stopped at random moments from their imports on
+    python benchmarks/faults.py flips --number 20000 # in any file of a run that is gone on with
+
+*kills*: small runs with one environment, three environments, and compilation, each started with `resume=auto` until it
+has finished, and stopped by SIGKILL, SIGTERM, SIGINT or SIGUSR1 at random moments. Nothing may print a traceback, hang,
+or end with an unknown code; at the end curves, weights, best weights and buffer must be those of a run left alone.
+*flips*: one bit anywhere in the directory of a run; what is restored must be the newest checkpoint or an older one, to
+the last bit, or an error in one line. Both write `benchmarks/results/cpu/faults/<name>.json`. POSIX only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import dataclasses
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from cpu_learning import RESULTS, ROOT
+from torch import Tensor
+from torchrl import torchrl_logger
+
+from torchrl_etdmpc.checkpoints import CheckpointError
+from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions
+from torchrl_etdmpc.training import EXIT_CODE, TrainConfig, TrainingRun, plan_launch, read_agent_file
+
+SETTINGS = {
+    "task": "cartpole-balance",
+    "preset": "cpu",
+    "seed": 3,
+    "device": "cpu",
+    "threads": 1,
+    "total_env_steps": 400,
+    "episode_length": 200,
+    "log_every": 40,
+    "eval_every": 150,
+    "eval_episodes": 1,
+    "checkpoint_every": 30,
+    "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16},
+    "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+    "reanalyze": {"num_samples": 6, "num_elites": 3, "iterations": 1},
+    "optim": {"batch_size": 4},
+    "replay": {"seed_decisions": 40, "pretrain_updates": 4},
+}
+KINDS = {"one environment": {"compile": "off"}, "three environments": {"compile": "off", "num_envs": 3}}
+KINDS |= {"compiled": {"compile": "default"}}
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+EXPECTED = {0, EXIT_CODE, 130} | {-number for number in SIGNALS} | {128 + number for number in SIGNALS}
+LIMIT_S = 600
+
+
+def configuration(changes: Mapping[str, Any]) -> TrainConfig:
+    return TrainConfig.from_dict({**SETTINGS, **changes})
+
+
+def command(run_dir: Path, changes: Mapping[str, Any]) -> list[str]:
+    values = {**SETTINGS, **changes, "task.episode_length": SETTINGS["episode_length"]}
+    del values["episode_length"]
+    flat = [
+        f"{name}.{key}={item}" if isinstance(value, dict) else f"{name}={value}"
+        for name, value in values.items()
+        for key, item in (value.items() if isinstance(value, dict) else [("", value)])
+    ]
+    script = str(ROOT / "examples" / "train_dmc.py")
+    return [sys.executable, script, *flat, f"run_dir={run_dir}", "resume=auto"]
+
+
+def plain(value: Any) -> Any:
+    """A value that can be compared: tensors as their bytes, without times."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items() if "wall" not in str(key)}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return (str(value.dtype), value.shape, value.cpu().numpy().tobytes()) if isinstance(value, Tensor) else value
+
+
+def results(run_dir: Path) -> dict[str, Any]:
+    """What a run came to, without times."""
+    directory = RunDirectory(run_dir)
+    answer: dict[str, Any] = {}
+    for file in (directory.train, directory.eval):
+        with file.open(newline="") as opened:
+            rows = csv.DictReader(opened)
+            answer[file.name] = [{key: value for key, value in row.items() if key != "wall_time_s"} for row in rows]
+    for file in (directory.last_agent, directory.best_agent):
+        answer[file.name] = plain(read_agent_file(file))
+    newest = max((directory.checkpoints / "resume").glob("[0-9]*"))
+    replay = json.loads((newest / "manifest.json").read_text())["replay"]
+    answer["buffer"] = replay["written"]
+    return answer
+
+
+# -- kills ------------------------------------------------------------------------------------------------------------
+
+
+def run_once(run_dir: Path, changes: Mapping[str, Any], stop: tuple[float, int] | None) -> tuple[int, str, float]:
+    """Exit code, what was printed, and seconds of one process, stopped after so many seconds by a signal."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "disable"}
+    tick = time.monotonic()
+    process = subprocess.Popen(
+        command(run_dir, changes),
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # also in the background
+    )
+    try:
+        if stop is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(stop[0])
+            if process.poll() is None:
+                os.killpg(process.pid, stop[1]) if stop[1] == signal.SIGINT else process.send_signal(stop[1])
+        text, _ = process.communicate(timeout=LIMIT_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        text, _ = process.communicate()
+        return 10_000, text, LIMIT_S
+    return process.returncode, text, time.monotonic() - tick
+
+
+def orphans(run_dir: Path) -> list[int]:
+    """Processes of the run's session that outlived it."""
+    found = subprocess.run(["pgrep", "-f", str(run_dir)], capture_output=True, text=True, check=False).stdout.split()
+    return [int(number) for number in found]
+
+
+def kills(number: int, seed: int, folder: Path) -> dict[str, Any]:
+    chance, done, complaints = random.Random(seed), Counter(), []
+    codes: Counter[str] = Counter()
+    straight: dict[str, tuple[dict[str, Any], float]] = {}
+    series, equal = 0, 0
+    share = {"one environment": 0.5, "three environments": 0.4, "compiled": 0.1}
+    for kind, changes in KINDS.items():
+        code, text, _ = run_once(folder / kind.replace(" ", "-"), changes, None)  # fills the compilation cache
+        if code:
+            raise RuntimeError(text)
+        shutil.move(folder / kind.replace(" ", "-"), folder / "first")
+        shutil.rmtree(folder / "first")
+        code, text, seconds = run_once(folder / kind.replace(" ", "-"), changes, None)
+        straight[kind] = results(folder / kind.replace(" ", "-")), seconds
+        print(f"{kind}: {seconds:.0f} s when left alone", flush=True)
+    for kind, changes in KINDS.items():
+        while done[kind] < share[kind] * number:
+            run_dir = folder / f"series-{series}"
+            series += 1
+            expected, seconds = straight[kind]
+            for attempt in range(40):
+                last = attempt == 39 or done[kind] >= share[kind] * number
+                stop = None if last else (chance.uniform(0, 1.1 * seconds), chance.choice(SIGNALS))
+                code, text, _ = run_once(run_dir, changes, stop)
+                codes[signal.Signals(-code).name if code < 0 else str(code)] += 1
+                what = f"{kind}, series {series}, attempt {attempt}, {stop}, code {code}"
+                if "Traceback" in text or code not in EXPECTED or "Exception ignored" in text:
+                    complaints.append(f"{what}: {text[-2000:]}")
+                done[kind] += stop is not None and code != 0
+                left = orphans(run_dir)
+                if left:
+                    time.sleep(15)  # the environments' processes go within ten seconds
+                    if orphans(run_dir):
+                        complaints.append(f"{what}: processes stay: {orphans(run_dir)}")
+                if code == 0:
+                    break
+            try:
+                same = results(run_dir) == expected
+            except Exception as error:
+                same = False
+                complaints.append(f"{kind}, series {series}: {error}")
+            equal += same
+            if not same:
+                shutil.move(run_dir, folder / f"different-{series}")
+                complaints.append(f"{kind}, series {series}: another end than the run that was left alone")
+            else:
+                shutil.rmtree(run_dir)
+            print(f"{sum(done.values())} stopped, {series} series, {equal} equal, {len(complaints)} bad", flush=True)
+    return {"stopped": sum(done.values()), "by_kind": done, "series": series, "equal": equal, "exit_codes": codes} | {
+        "complaints": complaints
+    }
+
+
+# -- flips ------------------------------------------------------------------------------------------------------------
+
+
+def make_run(config: TrainConfig, run_dir: Path) -> TrainingRun:
+    env = make_env(config.task_spec, seed=config.seed)
+    eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)
+    log = RunLog(RunDirectory(run_dir), total_env_steps=config.total_env_steps)
+    return TrainingRun(config, env=env, eval_env=eval_env, log=log)
+
+
+def state(run: TrainingRun) -> Any:
+    parts = {name: plain(part.state_dict()) for name, part in run.parts.items() if name != "random"}
+    directory = run.log.directory
+    files = {file.name: file.read_bytes() if file.exists() else b"" for file in (directory.train, directory.eval)}
+    return parts, plain(run.learner.replay[:].to_dict()), files, read_agent_file(directory.best_agent)["counters"]
+
+
+def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
+    chance, found, complaints = random.Random(seed), Counter(), []
+    run_dir = folder / "run"
+    config = configuration({"compile": "off", "run_dir": str(run_dir), "resume": "on", "total_env_steps": 200})
+    whole = folder / "whole"
+    run = make_run(config, run_dir)
+    run.log.directory.begin(config.to_dict())
+    run.run()
+    run.log.directory.close()
+    RunDirectory(run_dir).summary.unlink()  # so that there is something to go on with
+    shutil.copytree(run_dir, whole)
+    files = sorted(path for path in whole.rglob("*") if path.is_file() and path.name != "curve.png")
+    run = make_run(config, run_dir)
+
+    def restored(**changes: Any) -> Any:
+        run.config = plan_launch(dataclasses.replace(config, **changes), changes).config
+        run.learner.replay.empty()
+        run.resume()
+        return run.config.to_dict(), state(run)
+
+    expected = [restored()]
+    newest = max((run_dir / "checkpoints" / "resume").iterdir())
+    shutil.rmtree(newest)
+    expected.append(restored())
+    by_file: Counter[str] = Counter()
+    for count in range(number):
+        shutil.rmtree(run_dir)
+        shutil.copytree(whole, run_dir)
+        source = chance.choice(files)
+        target = run_dir / source.relative_to(whole)
+        data = bytearray(source.read_bytes())
+        place = chance.randrange(len(data))
+        data[place] ^= 1 << chance.randrange(8)
+        target.unlink()
+        target.write_bytes(data)
+        name = re.sub(r"\d+|-[0-9a-f]{8}", "*", str(source.relative_to(whole)))
+        by_file[name] += 1
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            try:
+                outcome = restored()
+            except (CheckpointError, ValueError, OSError) as error:
+                if "\n" in str(error):
+                    complaints.append(f"{name}, byte {place}: {error}")
+                if "resume=weights" in str(error):
+                    restored(resume="weights")
+                    found["refused, and gone on with by resume=weights"] += 1
+                else:
+                    found["refused"] += 1
+                continue
+            except Exception as error:
+                complaints.append(f"{name}, byte {place}: {type(error).__name__}: {error}")
+                continue
+        if outcome == expected[0]:
+            found["exact, with a warning" if said else "exact"] += 1
+        elif outcome == expected[1] and said:
+            found["passed over for the checkpoint before"] += 1
+        else:
+            complaints.append(f"{name}, byte {place}: restored something else")
+        if count % 500 == 0:
+            print(count, dict(found), len(complaints), flush=True)
+    return {"flips": number, "outcomes": found, "by_file": by_file, "complaints": complaints}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=["kills", "flips"])
+    parser.add_argument("--number", type=int)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=RESULTS / "faults")
+    arguments = parser.parse_args()
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(1)
+    number = arguments.number or {"kills": 300, "flips": 20_000}[arguments.what]
+    tick = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        answer = {"seed": arguments.seed} | globals()[arguments.what](number, arguments.seed, Path(folder))
+    answer |= {"minutes": round((time.monotonic() - tick) / 60, 1), "versions": library_versions()}
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / f"{arguments.what}.json").write_text(json.dumps(answer, indent=1) + "\n")
+    print(json.dumps({name: value for name, value in answer.items() if name != "complaints"}, indent=1))
+    if answer["complaints"]:
+        sys.exit("error: " + "\n".join(answer["complaints"][:20]))
+
+
+if __name__ == "__main__":
+    main()
