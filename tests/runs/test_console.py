@@ -36,11 +36,11 @@ def test_a_warning_has_no_source_line(capsys):
 
 
 def test_what_was_there_before_comes_back(capsys):
-    handlers, show = torchrl_logger.handlers, warnings.showwarning
+    handlers, form = torchrl_logger.handlers, warnings.formatwarning
     with console():
         pass
     assert torchrl_logger.handlers is handlers
-    assert warnings.showwarning is show
+    assert warnings.formatwarning is form
 
 
 def test_without_tqdm_there_are_lines_too(monkeypatch, capsys):
