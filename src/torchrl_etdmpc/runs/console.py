@@ -6,6 +6,7 @@ import contextlib
 import logging
 import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -52,6 +53,8 @@ def _format_warning(message: Any, category: Any, filename: str, lineno: int, lin
 
 
 def _write(line: str, stream: TextIO) -> None:
+    if stream.isatty():  # which would break words
+        line = "\n         ".join(textwrap.wrap(line, shutil.get_terminal_size().columns - 9, break_long_words=False))
     try:
         from tqdm import tqdm
     except ImportError:
