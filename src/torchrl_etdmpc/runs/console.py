@@ -29,7 +29,7 @@ def console() -> Iterator[None]:
     """
     handler = _Lines()
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-    before, torchrl_logger.handlers = torchrl_logger.handlers, [handler]
+    before, torchrl_logger.handlers = torchrl_logger.handlers, list[logging.Handler]([handler])
     form, warnings.formatwarning = warnings.formatwarning, _format_warning
     try:
         yield

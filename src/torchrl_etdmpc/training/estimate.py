@@ -100,7 +100,7 @@ def _flops_per_second(config: TrainConfig) -> float:
     left, right = torch.ones(rows, config.model.mlp_dim), torch.ones(config.model.mlp_dim, config.model.mlp_dim)
     products, began = 0, time.perf_counter()
     while products < 3 or time.perf_counter() - began < 0.02:
-        left @ right
+        _ = left @ right
         products += 1
     seconds = time.perf_counter() - began
     return 2.0 * rows * config.model.mlp_dim**2 * products / seconds
