@@ -111,6 +111,11 @@ def test_a_command_names_settings_and_options_that_exist(command, own_module, mo
         monkeypatch.setattr("sys.argv", [script, *arguments])
         report.parse()
         return
+    if "--help" in arguments:
+        monkeypatch.setattr("sys.argv", [script, *arguments])
+        runpy.run_path(str(path), run_name="__main__")
+        assert "usage: " in capsys.readouterr().out
+        return
     arguments += [] if "--cfg" in arguments else ["--cfg", "job"]
     monkeypatch.setattr("sys.argv", [script, *arguments])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # the script sets it; this restores it
