@@ -27,14 +27,15 @@ help:
 # The command then speaks of RUN_DIR and ARGS, as they were typed here.
 train: export TORCHRL_ETDMPC_MAKE := 1
 train: $(READY)
-	@echo "$(TASK) learns on this CPU: the first minutes compile, then there are about 5 more; Ctrl-C stops and saves"
+	@echo "$(TASK) learns on this CPU, in some minutes; Ctrl-C stops and saves"
 	@$(VENV)/bin/python examples/train_dmc.py task=$(TASK) preset=cpu seed=1 total_env_steps=25000 eval_every=5000 run_dir="$(RUN_DIR)" $(ARGS)
 	@echo 'the curve:        $(RUN_DIR)/curve.png'
 	@echo 'a film of it:     make watch$(SAME_RUN)'
 	@echo 'a report:         make report$(SAME_RUN)'
-	@echo 'train on:         make train$(SAME_RUN) ARGS="resume=true total_env_steps=50000"'
+	@echo 'train on:  make train$(SAME_RUN) ARGS="resume=true total_env_steps=50000"'
 	@echo 'another task:     make train TASK=cup-catch'
-	@echo 'all tasks, help:  $(VENV)/bin/python examples/train.py task=list    $(VENV)/bin/python examples/train.py --help'
+	@echo 'all the tasks:    $(VENV)/bin/python examples/train.py task=list'
+	@echo 'all settings:     $(VENV)/bin/python examples/train.py --help'
 
 watch: $(READY)
 	@$(VENV)/bin/python examples/evaluate.py checkpoint="$(RUN_DIR)/checkpoints/best.pt" episodes=1 video="$(RUN_DIR)/film.mp4" $(ARGS)

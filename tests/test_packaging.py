@@ -234,6 +234,7 @@ def test_the_pins_satisfy_the_declared_ranges_of_everything_that_the_commands_ne
         *extras["analysis"],
         *extras["test"],
         *extras["tensorboard"],
+        *extras["wandb"],
     ]
     pins = _pins()
     for requirement in map(Requirement, declared):

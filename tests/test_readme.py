@@ -64,7 +64,7 @@ def own_module(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("page", "code"), BLOCKS, ids=[page for page, _ in BLOCKS])
 def test_a_block_of_python_runs_as_it_is_printed_and_a_pipeline_trains_the_planner_s_weights(page, code):
     pytest.importorskip("gymnasium")
-    names = run_block(code)
+    names = run_block(code.replace("total_frames=3_000", "total_frames=200"))  # one episode of the README's
     if "collector" not in names:
         assert page != "README.md"
         return
@@ -73,6 +73,19 @@ def test_a_block_of_python_runs_as_it_is_printed_and_a_pipeline_trains_the_plann
     assert names["planner"].world_model is names["world_model"]
     assert len(names["buffer"]) == 200
     assert names["buffer"][:]["plan", "version"].max() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*auto_register_policy_transforms.*:FutureWarning")
+def test_the_pipeline_of_the_readme_prints_a_return_that_rises(capsys):
+    pytest.importorskip("gymnasium")
+    (code,) = (code for page, code in BLOCKS if page == "README.md" and "collector" in code)
+    assert "total_frames=3_000" in code
+    run_block(code)
+    returns = [float(line.rpartition(" ")[2]) for line in capsys.readouterr().out.splitlines()]
+    assert len(returns) == 15
+    assert max(returns[:2]) < -800
+    assert sum(returns[-5:]) / 5 > -400
 
 
 def test_the_task_of_the_docs_keeps_the_contract(own_module):
@@ -97,6 +110,11 @@ def test_a_command_names_settings_and_options_that_exist(command, own_module, mo
 
         monkeypatch.setattr("sys.argv", [script, *arguments])
         report.parse()
+        return
+    if "--help" in arguments:
+        monkeypatch.setattr("sys.argv", [script, *arguments])
+        runpy.run_path(str(path), run_name="__main__")
+        assert "usage: " in capsys.readouterr().out
         return
     arguments += [] if "--cfg" in arguments else ["--cfg", "job"]
     monkeypatch.setattr("sys.argv", [script, *arguments])

@@ -171,8 +171,8 @@ def test_an_id_that_misses_its_library_says_so_in_one_line(monkeypatch, recorder
     with pytest.raises(ImportError) as error:
         make_env(name)
     assert str(error.value) == (
-        f"{name} cannot be made: Box2D is not installed, you can install it "
-        "(torchrl_etdmpc[gym] installs what MuJoCo and classic control need)."
+        f"{name} cannot be made: Box2D is not installed, you can install it (for MuJoCo and classic control run: "
+        "pip install 'gymnasium[mujoco,classic-control]>=1.4,<2' 'mujoco<4')."
     )
 
 

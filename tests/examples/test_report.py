@@ -352,3 +352,62 @@ def test_the_line_on_the_terminal_names_what_was_compared(run_main, capfd):
 def test_a_wrong_benchmark_ends_a_watch_before_it_begins(refused):
     make_run("runs/a")
     assert refused("runs", "--watch", "--benchmark", "atari").startswith("unknown benchmark 'atari'; choose one of ")
+
+
+def test_runs_of_different_lengths_are_compared_at_the_largest_budget_that_all_reach(run_main, capfd):
+    make_run("runs/a")
+    make_run("runs/b", seed=2, text=HEADER + ROWS.format(seed=2) + "200000,100000,7,1.0,70,0,1\n")
+    run_main("runs")
+    out, err = capfd.readouterr()
+    assert out == (
+        "2 runs on 1 task of Easy DMC, up to 200,000 env steps, compared at 100,000, which all of them reach (the "
+        "benchmark's budget is 200,000); the report is report/index.md\n"
+    )
+    assert err == ""
+    assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 200
+
+
+def test_a_short_run_has_a_report_without_dashes(run_main, capfd):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 25_001, 5_000))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs/a")
+    assert "compared at 25,000, which all of them reach" in capfd.readouterr().out
+    row = read_table(Path("report", "final.csv"))["walker-walk"]
+    assert float(row["cpu"]) == 250
+    assert row["BMPC"] not in ("", "-")
+
+
+def test_a_run_that_has_only_begun_is_named(refused):
+    make_run("runs/a", text=HEADER + "0,0,7,1.0,3,0.5,10\n")
+    assert refused("runs") == (
+        "cpu on walker-walk with seed 1 has only its first evaluation yet, at 0 env steps; wait, or leave that run out."
+    )
+
+
+def test_one_broken_run_is_skipped_and_named(run_main, capfd):
+    make_run("runs/a")
+    make_run("runs/b", seed=2, text=HEADER + "0,0,7,1.0,much,0.5,10\n")
+    (make_run("runs/c", seed=3) / "config.yaml").unlink()
+    run_main("runs", "--reference")
+    out, err = capfd.readouterr()
+    assert out.startswith("1 run on 1 task of Easy DMC")
+    first, second = err.splitlines()
+    assert first.startswith("skipped runs/b: runs/b/eval.csv: column return_mean must hold numbers")
+    assert second == "skipped runs/c: runs/c has neither config.yaml nor summary.json, which name its task and seed."
+
+
+def test_without_pandas_there_is_one_line(monkeypatch, refused):
+    make_run("runs/a")
+    for name in [name for name in sys.modules if name.partition(".")[2].startswith("analysis")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    assert refused("runs") == (
+        "reports need pandas, which is not installed; run: pip install matplotlib pandas pyyaml scipy"
+    )
+
+
+def test_the_home_directory_may_be_short(monkeypatch, tmp_path, run_main, capfd):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    make_run("my runs/a")
+    run_main("~/my runs", "--out", "~/a report", "--reference")
+    assert (tmp_path / "a report" / "index.md").is_file()

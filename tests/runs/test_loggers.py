@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import http.server
 import importlib.util
 import math
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -68,22 +71,36 @@ def test_tensorboard_holds_the_same_numbers_against_environment_steps(tmp_path):
 
 @pytest.fixture
 def no_account(tmp_path, monkeypatch):
-    pytest.importorskip("wandb")
-    for name in ("WANDB_API_KEY", "WANDB_MODE"):
-        monkeypatch.delenv(name, raising=False)
+    """The real wandb, without what this machine knows of an account; its service process ends with the test."""
+    wandb = pytest.importorskip("wandb")
+    for name in [name for name in os.environ if name.startswith("WANDB_")]:
+        monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("NETRC", str(tmp_path / "home" / "netrc"))
+    monkeypatch.setattr("torchrl_etdmpc.runs.loggers._WANDB_TIMEOUT_S", 4)
+    yield
+    wandb.teardown()
 
 
-def test_wandb_works_offline_without_an_account(tmp_path, no_account):
-    log = start(tmp_path / "run", "wandb")
+def train_a_little(log: RunLog) -> None:
     log.log_train({"loss_value": 0.25}, **COUNTERS)
     log.log_eval({"return_mean": 31.0, "return_std": 4.0, "episodes": 10}, **COUNTERS)
     log.finish({})
-    (record,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
+
+
+def offline_records(run_dir: Path) -> list[Path]:
+    return sorted((run_dir / "wandb").glob("offline-run-*/*.wandb"))
+
+
+def assert_holds_the_run(record: Path) -> None:
     content = record.read_bytes()
-    for key in (b"loss_value", b"return_mean", b"walker-walk"):
-        assert key in content
+    assert all(key in content for key in (b"loss_value", b"return_mean", b"walker-walk"))
+
+
+def test_wandb_works_offline_without_an_account(tmp_path, no_account):
+    train_a_little(start(tmp_path / "run", "wandb"))
+    (record,) = offline_records(tmp_path / "run")
+    assert_holds_the_run(record)
 
 
 def test_a_run_that_goes_on_is_the_same_one_for_wandb(tmp_path, no_account):
@@ -92,4 +109,48 @@ def test_a_run_that_goes_on_is_the_same_one_for_wandb(tmp_path, no_account):
     log.close()
     make_logger("wandb", log.directory, CONFIG).shutdown()
     assert log.directory.wandb_id.read_text() == known
-    assert {path.name.split("-")[-1] for path in (tmp_path / "run" / "wandb").glob("offline-run-*")} == {known}
+    # A folder of the same second has a number behind the id.
+    assert [path.name.split("-")[3] for path in (tmp_path / "run" / "wandb").glob("offline-run-*")] == [known, known]
+    assert {record.name for record in offline_records(tmp_path / "run")} == {f"run-{known}.wandb"}
+
+
+@pytest.mark.slow  # wandb asks for 20 seconds
+def test_a_service_that_cannot_be_reached_does_not_stop_a_run(tmp_path, monkeypatch, no_account):
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
+    monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")  # nobody listens to the port of discard
+    with pytest.warns(
+        UserWarning, match=r"^wandb cannot be reached \(.+\), so it is offline; `wandb sync` sends it later"
+    ):
+        log = start(tmp_path / "run", "wandb")
+    train_a_little(log)
+    assert_holds_the_run(offline_records(tmp_path / "run")[-1])
+
+
+class _Refusing(http.server.BaseHTTPRequestHandler):
+    """A service that knows nobody."""
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        body = b'{"errors": [{"message": "permission denied"}]}'
+        self.send_response(401)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    do_GET = do_POST
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+def test_a_key_that_is_wrong_does_not_stop_a_run(tmp_path, monkeypatch, no_account):
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Refusing) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setenv("WANDB_API_KEY", "1" * 40)
+        monkeypatch.setenv("WANDB_BASE_URL", f"http://127.0.0.1:{server.server_port}")
+        with pytest.warns(UserWarning, match=r"^wandb cannot be reached \(.+\), so it is offline"):
+            log = start(tmp_path / "run", "wandb")
+        train_a_little(log)
+        server.shutdown()
+    assert_holds_the_run(offline_records(tmp_path / "run")[-1])

@@ -366,8 +366,8 @@ REFUSED_AT_ONCE = [
         ({name: 0}, f"{name} of task 'walker-walk' must be at least 1, got 0.")
         for name in ("action_repeat", "episode_length")
     ),
-    ({"resume": "yes"}, "resume must be one of off, on, auto, got 'yes'."),
-    ({"resume": 1}, "resume must be one of off, on, auto, got 1."),
+    ({"resume": "yes"}, "resume must be one of off, on, auto, weights, got 'yes'."),
+    ({"resume": 1}, "resume must be one of off, on, auto, weights, got 1."),
     ({"checkpoint_minutes": 0.0}, "checkpoint_minutes must be positive or null, got 0.0."),
     ({"seed": -1}, "seed must be in [0, 2**32 - 1], got -1."),
     ({"seed": 2**32}, "seed must be in [0, 2**32 - 1], got 4294967296."),

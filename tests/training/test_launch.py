@@ -179,9 +179,7 @@ def test_settings_that_a_command_does_not_name_are_the_run_s_before_anything_is_
     assert TrainConfig.from_dict(completed) == command(total_env_steps=200, resume="on")
     with pytest.raises(ValueError, match=r"^replay\.seed_decisions=5000 was asked for, but this run was started with"):
         with_stored_settings(values | typed, ["run_dir", "resume", "replay.seed_decisions"])
-    with pytest.raises(
-        ValueError, match=r"^task\.action_repeat=3 was asked for, .* started with task\.action_rep"
-    ):
+    with pytest.raises(ValueError, match=r"^task\.action_repeat=3 was asked for, .* started with task\.action_rep"):
         with_stored_settings(values | typed | {"action_repeat": 3}, ["action_repeat"])
     for resume in (False, "off"):
         assert with_stored_settings(values | typed | {"resume": resume}, ["run_dir"])["task"] == "walker-walk"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,13 +29,13 @@ def console() -> Iterator[None]:
     """
     handler = _Lines()
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-    before, torchrl_logger.handlers = torchrl_logger.handlers, [handler]
-    show, warnings.showwarning = warnings.showwarning, _show_warning
+    before, torchrl_logger.handlers = torchrl_logger.handlers, list[logging.Handler]([handler])
+    form, warnings.formatwarning = warnings.formatwarning, _format_warning
     try:
         yield
     finally:
         torchrl_logger.handlers = before
-        warnings.showwarning = show
+        warnings.formatwarning = form
 
 
 class _Lines(logging.Handler):
@@ -42,12 +44,17 @@ class _Lines(logging.Handler):
             _write(self.format(record), sys.stdout)
 
 
-def _show_warning(message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
+def _format_warning(message: Any, category: Any, filename: str, lineno: int, line: Any = None) -> str:
     time = logging.Formatter("%(asctime)s", "%H:%M:%S").format(logging.makeLogRecord({}))
-    _write(f"{time} warning: {' '.join(str(message).split())}", file or sys.stderr)
+    text = f"{time} warning: {' '.join(str(message).split())}"
+    if sys.stderr.isatty():  # over a bar, which is drawn anew below
+        return f"\r{text.ljust(shutil.get_terminal_size().columns - 1)}\n"
+    return f"{text}\n"
 
 
 def _write(line: str, stream: TextIO) -> None:
+    if stream.isatty():  # which would break words
+        line = "\n         ".join(textwrap.wrap(line, shutil.get_terminal_size().columns - 9, break_long_words=False))
     try:
         from tqdm import tqdm
     except ImportError:

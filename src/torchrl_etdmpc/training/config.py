@@ -140,6 +140,7 @@ class ReplayConfig:
     insertion: Insertion = "step"
     """Whether a transition can be sampled at once or after its episode."""
     uniform_over: UniformOver = "episodes"
+    """Whether a slice is drawn by its episode first, which favours the running one, or from all alike."""
     device: Literal["auto", "cpu", "run"] = "auto"
     """Where the storage lives: ``cpu``; ``run``, the run's device; ``auto``, the run's device if the full buffer takes
     at most half of its free memory."""

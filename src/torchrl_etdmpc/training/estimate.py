@@ -45,11 +45,17 @@ def estimated_seconds(config: TrainConfig) -> float:
     )
 
 
-def what_it_takes(config: TrainConfig, device: torch.device) -> str:
-    """How long the run will take on this machine, and what to do about it if that is long."""
+def what_it_takes(config: TrainConfig, device: torch.device, env_steps: int = 0) -> str:
+    """How long the run will take on this machine, and what to do about it if that is long.
+
+    Args:
+        config (TrainConfig): the run.
+        device (torch.device): its device.
+        env_steps (int): what it has behind it, if it goes on. Default: 0.
+    """
     if device.type == "cuda":
         return f"on {torch.cuda.get_device_name(device)}"
-    seconds = estimated_seconds(config)
+    seconds = estimated_seconds(config) * (1 - env_steps / config.total_env_steps)
     compiled = "" if config.compile == "off" else ", and before it some minutes to compile the first time"
     line = f"about {_duration(seconds)} on this CPU{compiled}"
     if config.preset != "cpu" and seconds > 3600:
@@ -94,7 +100,7 @@ def _flops_per_second(config: TrainConfig) -> float:
     left, right = torch.ones(rows, config.model.mlp_dim), torch.ones(config.model.mlp_dim, config.model.mlp_dim)
     products, began = 0, time.perf_counter()
     while products < 3 or time.perf_counter() - began < 0.02:
-        left @ right
+        _ = left @ right
         products += 1
     seconds = time.perf_counter() - began
     return 2.0 * rows * config.model.mlp_dim**2 * products / seconds

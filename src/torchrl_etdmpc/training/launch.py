@@ -143,7 +143,8 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
                 run.resume()  # before anything of the run is changed: it may not be possible
             directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
             directory.write_config(config.to_dict())
-            what, takes = f"{config.task} with preset {config.preset}", what_it_takes(config, run.learner.agent.device)
+            what = f"{config.task} with preset {config.preset}"
+            takes = what_it_takes(config, run.learner.agent.device, run.env_steps)
             torchrl_logger.info(f"{what}, {config.total_env_steps:,} env steps into {directory}: {takes}")
             return run.run()
         except BaseException:

@@ -39,7 +39,7 @@ def require_memory(config: TrainConfig, observation_dim: int, action_dim: int, d
         there = _memory_bytes(where)
         if there is not None and needed > there:
             raise ValueError(
-                f"{name} would take {needed / 1e9:,.0f} GB with these settings, and {where} has {there / 1e9:,.0f}; "
+                f"{name} would take {needed / 1e9:,.1f} GB with these settings, and {where} has {there / 1e9:,.1f}; "
                 "choose smaller sizes."
             )
 

@@ -257,8 +257,7 @@ class TrainingRun:
 
     def evaluate(self) -> None:
         """Appends a row to ``eval.csv``."""
-        rounds = -(-self.config.eval_episodes // max(self.evaluator.env.batch_size.numel(), 1))
-        steps = self.config.task_spec.decision_steps_per_episode * rounds * (1 + self.config.eval_policy)
+        steps = self.config.task_spec.decision_steps_per_episode * (1 + self.config.eval_policy)  # all side by side
         try:
             with progress_bar("evaluation", steps, "decisions", passing=True) as progress:
                 result = self.evaluator(on_step=lambda _: self._on_evaluation_step(progress))

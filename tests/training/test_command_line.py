@@ -1,0 +1,98 @@
+"""What was typed, checked before Hydra sees it."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+pytest.importorskip("hydra")
+
+from torchrl_etdmpc.commands.train import CONFIG  # noqa: E402
+from torchrl_etdmpc.training import TrainConfig, as_typed, hydra_main  # noqa: E402
+
+
+@pytest.fixture
+def run_command(monkeypatch, capfd):
+    """What a command line makes of the arguments: a configuration, or the message that it ends with."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+
+    def run(*arguments: str, config_class: type = TrainConfig) -> TrainConfig | str:
+        received = []
+        monkeypatch.setattr(sys, "argv", ["/bin/command", *arguments])
+        try:
+            hydra_main(CONFIG, "train", config_class)(received.append)()
+        except SystemExit as stop:
+            assert capfd.readouterr() == ("", "")
+            assert "\n" not in stop.code
+            return stop.code
+        return received[0] if received else capfd.readouterr().out
+
+    return run
+
+
+NEAREST = "did you mean planner.horizon or reanalyze.horizon? --help lists all."
+WRONG = [
+    (("task", "walker-walk"), "a setting is written name=value, without dashes or spaces, got 'task'."),
+    (("--task=walker-walk",), "a setting is written name=value, without dashes or spaces, got '--task=walker-walk'."),
+    (("--preset", "cpu"), "a setting is written name=value, without dashes or spaces, got '--preset'."),
+    (("-x",), "unknown option -x; settings are written name=value, and --help lists them."),
+    (("--cfg", "jobs"), "--cfg must be followed by job, got 'jobs'."),
+    (("~planner.horizon",), "a setting cannot be removed, got '~planner.horizon'; planner.horizon=null may do."),
+    (("Task=walker-walk",), "unknown setting Task; did you mean task? --help lists all."),
+    (("planner.horizn=3",), f"unknown setting planner.horizn; {NEAREST}"),
+    (("horizon=3",), f"unknown setting horizon; {NEAREST}"),
+    (("lr=1",), "unknown setting lr; did you mean optim.lr? --help lists all."),
+    (("++zzz=4",), "unknown setting zzz; --help lists all."),
+    (("hydra.run.dir=x",), "unknown setting hydra.run.dir; --help lists all."),
+    (("planner=3",), "planner is a group of settings; --help planner lists them, e.g. planner.horizon=..."),
+    (("planner.horizon=[1",), "planner.horizon must be a whole number, got '[1'."),
+    (("planner.horizon=",), "planner.horizon must not be empty."),
+    (("optim.lr=1,2",), "optim.lr must be a number, got '1,2'."),
+    (("eval_policy={}",), "eval_policy must be true or false, got '{}'."),
+    (("planner.score=(",), "planner.score must be one of final, mean, adaptive, got '('."),
+    (("optim.lr=inf",), "optim.lr must be a finite number below 1e30, got inf."),
+    (("total_env_steps=1e400",), "total_env_steps must be a whole number below 2**53, got inf."),
+    (("run_dir=${nope}",), "run_dir cannot be read: Interpolation key 'nope' not found"),
+    (("--help", "planer"), "there is no group and no setting 'planer'; did you mean planner? --help lists all."),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
+def test_a_mistake_is_named_in_the_words_of_the_command(run_command, arguments, message):
+    assert run_command(*arguments) == f"error: {message}"
+
+
+@pytest.mark.parametrize(
+    "path", ["my run", "it's", "a{b", "a=b", "a,b", "a\\b", "a\\'b", "ends in\\", "(1)", "[2]", "ü", "#x", '"']
+)
+def test_a_path_is_taken_as_it_is_typed(run_command, path):
+    assert run_command(f"run_dir={path}").run_dir == path
+
+
+def test_the_home_directory_may_be_short(run_command, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    assert run_command("run_dir=~/my runs").run_dir == "/home/me/my runs"
+
+
+def test_quotes_of_hydra_and_its_plus_are_accepted(run_command):
+    assert run_command("run_dir='a b'", "+planner.horizon=4").planner.horizon == 4
+    assert run_command("run_dir='a b'").run_dir == "a b"
+
+
+def test_the_last_of_two_values_counts(run_command):
+    assert run_command("seed=2", "seed=3").seed == 3
+
+
+def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):
+    assert "usage: command [SETTING=VALUE ...]" in run_command("--help")
+    assert "planner.horizon=3 " in run_command("--help", "planner", "preset=cpu")
+    assert "walker-walk" in run_command("task=list")
+
+
+def test_messages_speak_the_words_of_make(monkeypatch):
+    text = "run_dir=runs/a already holds a run; go on with resume=true."
+    assert as_typed(text) == text
+    monkeypatch.setenv("TORCHRL_ETDMPC_MAKE", "1")
+    assert as_typed(text) == 'RUN_DIR=runs/a already holds a run; go on with ARGS="resume=true".'

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+
+from torchrl_etdmpc.training import PRESETS, TrainConfig, estimated_seconds, what_it_takes
+from torchrl_etdmpc.training import estimate as module
+
+
+def test_a_plan_takes_the_operations_that_were_counted():
+    """benchmarks/results/cpu/speed.md: a plan of one head, horizon 3 and 512 samples is 43.3 GFLOP, mean score."""
+    model = dataclasses.replace(TrainConfig().model, num_dynamics=4)
+    planner = dataclasses.replace(TrainConfig().planner, horizon=3)
+    flops = module.decision_flops(dataclasses.replace(TrainConfig(), model=model, planner=planner))[0]
+    assert 0.5 * 162e9 < flops < 2 * 162e9
+
+
+def test_the_time_grows_with_the_work(monkeypatch):
+    monkeypatch.setattr(module, "_flops_per_second", lambda config: 1e10)
+    config = PRESETS["cpu"]
+    longer = dataclasses.replace(config, total_env_steps=2 * config.total_env_steps)
+    assert 1.5 * estimated_seconds(config) < estimated_seconds(longer) < 3 * estimated_seconds(config)
+    assert estimated_seconds(PRESETS["efficient-tdmpc"]) > 100 * estimated_seconds(config)
+
+
+def test_the_full_size_on_a_cpu_is_said_to_take_long_and_the_small_preset_is_named(monkeypatch):
+    monkeypatch.setattr(module, "_flops_per_second", lambda config: 1e11)
+    line = what_it_takes(PRESETS["efficient-tdmpc"], torch.device("cpu"))
+    assert " days on this CPU" in line
+    assert line.endswith(
+        "preset=efficient-tdmpc is made for a GPU and there is none here: preset=cpu learns in minutes"
+    )
+    assert "GPU" not in what_it_takes(PRESETS["cpu"], torch.device("cpu"))
+
+
+def test_an_estimate_draws_no_random_numbers():
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    estimated_seconds(PRESETS["cpu"])
+    assert torch.equal(before, torch.get_rng_state())

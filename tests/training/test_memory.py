@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+
+from torchrl_etdmpc.training import PRESETS, TrainConfig  # noqa: E402
+from torchrl_etdmpc.training.memory import require_memory  # noqa: E402
+
+BUDGET = {"total_env_steps": 10**14}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_fits_into_four_gigabytes(monkeypatch, name):
+    monkeypatch.setattr("torchrl_etdmpc.training.memory._memory_bytes", lambda device: 4 * 10**9)
+    require_memory(PRESETS[name], 223, 38, torch.device("cpu"))  # dog's sizes, the largest
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"replay": {"capacity": 10**13}, **BUDGET}, "replay.capacity"),
+        ({"model": {"mlp_dim": 10**7}}, "model.*"),
+        ({"planner": {"num_samples": 10**9}}, "planner.*"),
+        ({"planner": {"horizon": 10**9}}, "planner.*"),
+        ({"reanalyze": {"num_samples": 10**9}}, "reanalyze.*"),
+        ({"optim": {"batch_size": 10**9}}, "optim.batch_size"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_sizes_beyond_the_memory_are_refused_by_name(settings, name):
+    with pytest.raises(ValueError, match="choose smaller sizes") as caught:
+        require_memory(TrainConfig.from_dict(settings), 24, 6, torch.device("cpu"))
+    assert str(caught.value).startswith(f"{name} would take ")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import pytest
+
+from torchrl_etdmpc.commands.evaluate import EvaluateConfig
+from torchrl_etdmpc.commands.export import ExportConfig
+from torchrl_etdmpc.training import TrainConfig, preset
+from torchrl_etdmpc.training.settings_help import groups_of, help_text, settings_of
+
+
+@pytest.mark.parametrize("config_class", [TrainConfig, EvaluateConfig, ExportConfig])
+def test_every_setting_has_a_meaning_in_a_docstring(config_class):
+    assert [name for name, setting in settings_of(config_class).items() if len(setting.meaning) < 8] == []
+
+
+def test_the_names_are_those_of_the_command_line():
+    names = set(settings_of(TrainConfig))
+    assert {"task", "task.action_repeat", "planner.horizon", "reanalyze.every", "optim.lr"} <= names
+    assert "action_repeat" not in names
+
+
+def test_a_meaning_comes_from_the_class_that_takes_the_argument_without_its_default_or_markup():
+    settings = settings_of(TrainConfig)
+    assert settings["model.dropout"].meaning == "of the first hidden layer of the value heads, in [0, 1)."
+    assert settings["optim.grad_clip_norm"].meaning == "largest gradient norm of the model and of the policy."
+    assert not any("`" in setting.meaning for setting in settings.values())
+
+
+def test_a_field_s_own_docstring_comes_first_and_a_group_inherits_those_of_its_base():
+    settings = settings_of(TrainConfig)
+    assert settings["planner.iterations"].meaning == settings["reanalyze.iterations"].meaning
+    assert settings["reanalyze.num_slices"].meaning.startswith("slices to re-plan")
+    assert settings["planner.score"].choices == ("final", "mean", "adaptive")
+
+
+def test_the_main_help_holds_usage_main_settings_defaults_and_groups_in_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = help_text(TrainConfig, "Trains.", "python examples/train.py")
+    assert "usage: python examples/train.py [SETTING=VALUE ...]" in text
+    assert "  total_env_steps=200000 " in text
+    assert "  eval_policy=false " in text
+    assert all(f"  {group}.*" in text for group in groups_of(TrainConfig))
+    assert "planner.horizon" not in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_group_or_one_setting_can_be_asked_for():
+    text = help_text(TrainConfig, "", "", ("planner",))
+    assert "planner.horizon=6" in text
+    assert "reanalyze" not in text
+    assert help_text(TrainConfig, "", "", ("optim.lr",)).splitlines() == [
+        "  optim.lr=0.0003                    Learning rate."
+    ]
+
+
+def test_a_preset_s_values_take_the_place_of_the_defaults():
+    values = {"planner.horizon": preset("cpu").planner.horizon}
+    assert "planner.horizon=3 " in help_text(TrainConfig, "", "", ("planner",), values)
+
+
+def test_what_must_be_given_is_in_the_usage():
+    assert "usage: torchrl-etdmpc evaluate checkpoint=... [" in help_text(EvaluateConfig, "", "torchrl-etdmpc evaluate")
