@@ -92,7 +92,7 @@ def with_collector(kind, env, planner, **options) -> Iterator[TensorDictBase]:
     collector = kind(env, planner, auto_register_policy_transforms=True, **options)
     try:
         for batch in collector:
-            yield batch.exclude("plan_mean", ("next", "plan_mean")).clone()
+            yield batch if batch is None else batch.exclude("plan_mean", ("next", "plan_mean")).clone()
     finally:
         collector.shutdown()
 
@@ -110,7 +110,7 @@ def with_async_batched(_) -> Iterator[TensorDictBase]:
     collector = AsyncBatchedCollector(create_env_fn=MAKERS, policy=planner, **options)
     try:
         for batch in collector:
-            yield batch.contiguous()
+            yield batch.clone()
     finally:
         collector.shutdown()
 
@@ -247,6 +247,21 @@ def test_a_pipeline_does_what_its_cell_says(source, storage, sampler, outcome, t
     error, sentence = OUTCOMES[outcome]
     with pytest.raises(error, match=sentence):
         learn(fill(source, storage, sampler, tmp_path))
+
+
+@pytest.mark.slow
+def test_rows_that_worker_processes_write_by_themselves_are_noticed():
+    sampler = StepSliceSampler(SLICE_LEN)
+    buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(200), sampler=sampler, batch_size=SLICE_LEN, shared=True)
+    batches = with_collector(MultiSyncCollector, MAKERS, make_planner(warm_start=False), replay_buffer=buffer)
+    next(batches)
+    buffer.sample()
+    next(batches)
+    with pytest.raises(
+        RuntimeError, match="saw 24 writes but the storage holds 48 of 200 rows; write through this buffer"
+    ):
+        buffer.sample()
+    batches.close()
 
 
 def test_every_source_is_in_the_table():

@@ -8,8 +8,14 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
 from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc import EfficientTDMPCLoss, EnsembleMPPIPlanner, LatentEnv, ReanalyzeTransform
-from torchrl_etdmpc import StepSliceSampler, WorldModel
+from torchrl_etdmpc import (
+    EfficientTDMPCLoss,
+    EnsembleMPPIPlanner,
+    LatentEnv,
+    ReanalyzeTransform,
+    StepSliceSampler,
+    WorldModel,
+)
 from torchrl_etdmpc.testing import random_slices
 
 SLICE_LEN, EPISODES, LENGTH = 3, 12, 4
