@@ -15,7 +15,7 @@ _RENAMED = {
 
 
 def test_an_unknown_key_is_refused(loss):
-    for name in ("value", "priority_weight", "next_observation"):
+    for name in ("value", "priority_weights", "next_observation"):
         with pytest.raises(ValueError, match=f"{name} is not an accepted tensordict key"):
             loss.set_keys(**{name: "x"})
 

@@ -135,7 +135,6 @@ def test_a_call_changes_nothing_in_its_input(loss, slices, total):
 def test_entries_that_the_loss_does_not_know_have_no_influence(loss, slices, run_seeded):
     out = run_seeded(loss.eval(), slices)
     slices["_weight"] = torch.rand(4, 3)
-    slices["priority_weight"] = torch.rand(4, 3)
     slices["td_error"] = torch.rand(4, 3)
     slices["index"] = torch.arange(12).view(4, 3)
     assert (run_seeded(loss, slices) == out).all()

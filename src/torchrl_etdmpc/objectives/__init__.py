@@ -4,7 +4,7 @@ from torchrl_etdmpc.objectives.efficient_tdmpc import EfficientTDMPCLoss
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, latent_rollout
 from torchrl_etdmpc.objectives.policy import EfficientTDMPCPolicyLoss, KLDirection, distillation
 from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term, TermFunction
-from torchrl_etdmpc.objectives.value import EfficientTDMPCValueLoss, imagined_value_target, value_error
+from torchrl_etdmpc.objectives.value import EfficientTDMPCValueLoss, imagined_value_target, td_error, value_error
 from torchrl_etdmpc.objectives.world_model import (
     EfficientTDMPCModelLoss,
     consistency_error,
@@ -29,6 +29,7 @@ __all__ = [
     "imagined_value_target",
     "latent_rollout",
     "reward_error",
+    "td_error",
     "termination_error",
     "value_error",
 ]

@@ -35,7 +35,8 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         kl_direction (str): ``"backward"`` (default, KL(pi || plan)) or ``"forward"``.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         distill (bool): whether to compute the policy term. The attribute can be changed later: pretraining on random
-            data turns it off. Default: ``True``.
+            data turns it off. The policy then has no gradient; where ``torch.distributed`` is initialised, and
+            ``DistributedDataParallel`` waits for one, it has a gradient of zero. Default: ``True``.
         extra_terms (sequence of Term): terms of one's own, see :class:`Term`. Default: none.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an

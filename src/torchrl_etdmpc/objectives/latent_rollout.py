@@ -32,6 +32,8 @@ class Slices(NamedTuple):
     counts: Tensor | None = None
     """``[T, B]`` bool: the steps that count; the content of the others has been replaced by harmless values. ``None``:
     all of them count."""
+    weights: Tensor | None = None
+    """``[T, B]``: how much each step counts in the losses, from a prioritised sampler. ``None``: all the same."""
     extra: Mapping[NestedKey, Tensor] | None = None
     """What else the terms read, by its key, ``[T, B, ...]``."""
 

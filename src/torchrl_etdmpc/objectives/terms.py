@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, get_args
 
 import torch
+import torch.distributed as dist
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import dispatch
 from torch import Tensor, nn
@@ -21,6 +22,8 @@ Reduction = Literal["none", "mean", "sum"]
 KLDirection = Literal["backward", "forward"]
 TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tensor, dict[str, Tensor]]]
 
+PRIORITY = "priority"
+"""Under which name among its metrics a term offers errors ``[T, B]`` to make priorities of, where there are weights."""
 _ROLLOUT_FIELDS = ("observation", "next_observation", "action")
 _FIELDS = (*_ROLLOUT_FIELDS, "reward", "terminated", "plan_loc", "plan_scale")
 
@@ -92,7 +95,7 @@ class Term:
             )
         if f"{self.name}_error" in self.metric_names:
             metrics = {f"{self.name}_error": error, **metrics}
-        if metrics.keys() != set(self.metric_names):
+        if metrics.keys() - {PRIORITY} != set(self.metric_names):
             raise ValueError(
                 f"the term {self.name!r} must return the metrics {sorted(self.metric_names)}, got {sorted(metrics)}; "
                 "name them in Term(metrics=...)."
@@ -100,12 +103,18 @@ class Term:
         return error, metrics
 
 
-def _reduced(term: Tensor, counts: Tensor | None, reduction: Reduction) -> Tensor:
+def _reduced(term: Tensor, slices: Slices, reduction: Reduction) -> Tensor:
     """A term ``[T, B]`` to a scalar, or to ``[B, T]`` without reduction; steps that do not count are zeros."""
-    if reduction == "mean":
-        return counted_mean(term, counts)
-    if counts is not None:
-        term = torch.where(counts, term, 0)
+    if slices.weights is None and reduction == "mean":
+        return counted_mean(term, slices.counts)
+    weights = slices.weights
+    if slices.counts is not None:
+        term = torch.where(slices.counts, term, 0)
+        weights = None if weights is None else torch.where(slices.counts, weights, 0)
+    if weights is not None:
+        term = term * weights
+        if reduction == "mean":  # as TorchRL's losses: the weighted average
+            return term.sum() / weights.sum().clamp_min(torch.finfo(weights.dtype).tiny)
     return term.sum() if reduction == "sum" else term.transpose(0, 1)
 
 
@@ -124,6 +133,11 @@ class LatentRolloutLoss(LossModule):
     losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
     ``"shifted_valid"``, where the batch has them; or at the key ``loss.loss_mask_key``. A step counts if no step of its
     slice up to it is masked, since the rollout goes through all of them; means divide by the number of those.
+
+    Where a prioritised sampler has written ``priority_weight``, the mean is weighted by it, slice by slice, and the new
+    priorities of the slices, the mean absolute errors of their values against the targets, are written into the batch
+    at ``td_error``, for ``buffer.update_tensordict_priority(batch)``: the only entry that a loss writes to its input.
+    ``loss.use_prioritized_weights = False`` leaves the weights aside. A loss without values has no priority to offer.
 
     Args:
         world_model (WorldModel): the networks, shared with the caller.
@@ -156,6 +170,9 @@ class LatentRolloutLoss(LossModule):
                 without one it is looked at only to refuse termination.
             plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
             plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``.
+            priority_weight (NestedKey): importance weight of each slice, ``[B, T]``, which a prioritised sampler
+                writes; optional.
+            priority (NestedKey): where the new priorities are written, ``[B, T]``, if the batch has weights.
         """
 
         observation: NestedKey = OBSERVATION
@@ -164,6 +181,8 @@ class LatentRolloutLoss(LossModule):
         terminated: NestedKey = TERMINATED
         plan_loc: NestedKey = (PLAN, LOC)
         plan_scale: NestedKey = (PLAN, SCALE)
+        priority_weight: NestedKey = "priority_weight"
+        priority: NestedKey = "td_error"
 
     tensor_keys: _AcceptedKeys  # pyright: ignore[reportIncompatibleMethodOverride]
     default_keys = _AcceptedKeys
@@ -369,7 +388,12 @@ class LatentRolloutLoss(LossModule):
             if fields[name] is not None:
                 fields[name] = fields[name].squeeze(-1)
         counts = None if counts is None else counts.transpose(0, 1)
-        return Slices(**fields, counts=counts, extra=entries or None)
+        weights = tensordict.get(self.tensor_keys.priority_weight, None) if self.use_prioritized_weights else None
+        if weights is not None:
+            # One weight per slice: that of its first row, which the sampler drew.
+            steps, slices = fields["action"].shape[:2]
+            weights = weights.reshape(slices, steps)[:, 0].expand(steps, slices).to(fields["action"].dtype)
+        return Slices(**fields, counts=counts, weights=weights, extra=entries or None)
 
     def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor:
         value = tensordict.get(key, None)
@@ -387,6 +411,12 @@ class LatentRolloutLoss(LossModule):
                 "sample.reshape(-1, slice_len)."
             )
         return value
+
+    def write_priority(self, tensordict: TensorDictBase, evaluated: dict[str, Tensor]) -> None:
+        """Moves the priorities of a batch, if there are some, from what :meth:`evaluate` returned into the batch."""
+        priority = evaluated.pop(PRIORITY, None)
+        if priority is not None:
+            tensordict.set(self.tensor_keys.priority, priority)
 
     def _counted_steps(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
         """The steps up to which nothing in their slice is masked, bool ``[B, T]``; ``None`` without a mask."""
@@ -435,9 +465,22 @@ class LatentRolloutLoss(LossModule):
             KeyError: if a key is missing.
         """
         terms = self.evaluate(self.slices(tensordict), self.targets(), self.reduction)
+        self.write_priority(tensordict, terms)
+        unread = self._parameters_without_a_term()
+        if unread and dist.is_available() and dist.is_initialized():
+            # DistributedDataParallel waits for a gradient of every parameter and cannot look for those without one in a
+            # TensorDict. Nobody sees this zero, and the gradient of these parameters is one.
+            name = next(iter(terms))
+            terms[name] = terms[name] + 0 * torch.stack([parameter.sum() for parameter in unread]).sum()
         out = TensorDict(terms, batch_size=[])
         self._clear_weakrefs(tensordict, out)
         return out
+
+    def _parameters_without_a_term(self) -> list[nn.Parameter]:
+        """Of the networks that only terms train which are not active."""
+        active = {name for term in self.active_terms for name in (term.name, *term.networks)}
+        idle = {name for term in self.terms for name in (term.name, *term.networks)} - active
+        return [p for name, own in self.network_parameters().items() if name in idle for p in own] if idle else []
 
     def targets(self) -> dict[str, dict[str, Tensor]]:
         """The parameters of the target networks, by network and name."""
@@ -461,7 +504,8 @@ class LatentRolloutLoss(LossModule):
             reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
         Returns:
-            dict: ``loss_*`` terms weighted by their coefficients, and detached metrics.
+            dict: ``loss_*`` terms weighted by their coefficients, and detached metrics; with weights also the
+            priorities ``[B, T]``, which :meth:`write_priority` takes out.
         """
         rollout = latent_rollout(self.world_model, slices)._replace(targets=targets)
         losses, metrics = {}, {}
@@ -469,11 +513,19 @@ class LatentRolloutLoss(LossModule):
             error, reported = term.evaluate(self.world_model, slices, rollout)
             weighted = self._discount_depth(error) if term.decayed else error
             coef = self.get_buffer(f"{term.name}_coef")
-            losses[f"loss_{term.name}"] = coef * _reduced(weighted, slices.counts, reduction)
+            losses[f"loss_{term.name}"] = coef * _reduced(weighted, slices, reduction)
+            if PRIORITY in reported:
+                metrics[PRIORITY] = self._priority(reported[PRIORITY], slices)
             for name in term.metric_names:
                 metric = reported[name]
                 metrics[name] = (counted_mean(metric, slices.counts) if metric.ndim else metric).detach()
         return losses | metrics
+
+    def _priority(self, error: Tensor, slices: Slices) -> Tensor:
+        """The mean of the errors ``[T, B]`` of each slice, for all of its rows, ``[B, T]``."""
+        counts = torch.ones_like(error) if slices.counts is None else slices.counts.to(error.dtype)
+        mean = (error * counts).sum(0) / counts.sum(0).clamp_min(1)
+        return mean.detach().unsqueeze(-1).repeat(1, len(error))
 
     def _discount_depth(self, error: Tensor) -> Tensor:
         """Weights ``[T, B]`` errors by ``rho^k``."""

@@ -13,7 +13,7 @@ from torch.func import functional_call
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term
 
 
 @torch.no_grad()
@@ -64,6 +64,23 @@ def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor,
     logits = world_model.value_head(head_rows(rollout.predicted[:-1]), dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
     error = two_hot_cross_entropy(logits, head_rows(target, heads), world_model.bins)
     return mean_of_head_rows(error.mean(0), heads)
+
+
+@torch.no_grad()
+def td_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor) -> Tensor:
+    """Distance of the values from their targets, ``mean_{i,j} |V_j(zhat_{k,i}) - y_k|``, the priority of TD-MPC.
+
+    Args:
+        world_model (WorldModel): the value heads.
+        rollout (LatentRollout): T steps of F heads.
+        target (Tensor): y, shape ``[T, B]``.
+
+    Returns:
+        Tensor: without gradient and dropout, shape ``[T, B]``.
+    """
+    heads = world_model.num_dynamics
+    values = world_model.values(head_rows(rollout.predicted[:-1]))
+    return mean_of_head_rows((values - head_rows(target, heads).unsqueeze(-1)).abs().mean(-1), heads)
 
 
 class EfficientTDMPCValueLoss(LatentRolloutLoss):
@@ -146,4 +163,7 @@ def _value(
     target = imagined_value_target(
         world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
     )
-    return value_error(world_model, rollout, target, dropout=loss.training), {"value_target": target}
+    metrics = {"value_target": target}
+    if slices.weights is not None:
+        metrics[PRIORITY] = td_error(world_model, rollout, target)
+    return value_error(world_model, rollout, target, dropout=loss.training), metrics

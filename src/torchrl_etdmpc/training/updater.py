@@ -108,7 +108,8 @@ class Updater:
         """One update.
 
         Args:
-            batch (TensorDictBase): slices, batch size [B, T].
+            batch (TensorDictBase): slices, batch size [B, T]; if they have priority weights, their new priorities are
+                written into it, as the loss does.
             distill (bool): whether to train the policy (pretraining does not).
 
         Returns:
@@ -127,6 +128,7 @@ class Updater:
         else:
             with tracing_gradients():
                 metrics, gradients, skip = self._compiled(*inputs)
+        self.loss.write_priority(batch, metrics)
         for name, not_finite in skip.items():
             for part in _CLIPPED_TOGETHER[name]:
                 self._flat[part].grad = gradients[part]
