@@ -122,7 +122,6 @@ class StepCollector(BaseCollector):
         self._next_trajectory = 0
         self._carrier: TensorDictBase | None = None
         self._after_reset = False
-        self._begun = False  # whether the environment is at a place worth coming back to
         self._last_rows: int | torch.Tensor | None = None
         self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
         self._schema: dict[bool, set] = {}
@@ -182,7 +181,6 @@ class StepCollector(BaseCollector):
             acted (TensorDictBase): what :meth:`act` returned.
         """
         stepped, carrier = self._ask(self.env.step_and_maybe_reset, acted)
-        self._begun = True
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
         self._check_schema(kept, self.in_seed_phase)
@@ -294,12 +292,10 @@ class StepCollector(BaseCollector):
 
         Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)`` reads them.
         """
-        # Before its first step an environment cannot always be asked: TorchRL's ActionScaling makes its buffers then,
-        # and a worker process that fails to read them is lost.
         return OrderedDict(
             frames=self._frames,
             next_trajectory=self._next_trajectory,
-            simulator=simulator_state(self.env) if self._begun else None,
+            simulator=simulator_state(self.env),
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
         )
@@ -324,7 +320,6 @@ class StepCollector(BaseCollector):
                 stacklevel=2,
             )
             return
-        self._begun = True
         if state_dict["carrier"] is None:  # between episodes
             return
         batch_size, device = self.env.batch_size, self.env.device

@@ -127,8 +127,15 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
     Returns:
         dict, optional: tensors only, or ``None`` if the environment cannot be restored.
     """
-    state = _simulator(env).state_dict()
-    workers = list(state.values()) if isinstance(_simulator(env), BatchedEnvBase) else [state]
+    simulator = _simulator(env)
+    if isinstance(simulator, BatchedEnvBase):
+        # Workers with transforms have none, and must not be asked: before its first step, TorchRL's ActionScaling
+        # cannot tell its state, and a worker process that fails to is lost.
+        about = simulator.meta_data if isinstance(simulator.meta_data, list) else [simulator.meta_data]
+        if any(worker.env_str.startswith("TransformedEnv") for worker in about):
+            return None
+    state = simulator.state_dict()
+    workers = list(state.values()) if isinstance(simulator, BatchedEnvBase) else [state]
     return dict(state) if all(worker.get("_extra_state") is not None for worker in workers) else None
 
 
