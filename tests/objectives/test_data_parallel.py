@@ -42,6 +42,7 @@ def train(rank: int, world_size: int, store: Path) -> None:
             everywhere = [torch.zeros_like(parameter) for _ in range(world_size)]
             dist.all_gather(everywhere, parameter.detach())
             assert all(torch.equal(other, parameter) for other in everywhere)
+        dist.barrier()  # who leaves early takes the connection along
     finally:
         dist.destroy_process_group()
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 from torch.func import functional_call
-from torchrl.data import Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 from torchrl.modules import MPCPlannerBase
@@ -195,15 +195,74 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         # TorchRL's types know one key only.
         self.in_keys = [self.observation_key, *carried]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [unravel_key(action_key), *written]  # pyright: ignore[reportAttributeAccessIssue]
+        self._written = tuple(self.out_keys)
 
     @property
     def world_model(self) -> PredictionModel:
         """The networks that the planner reads."""
         return self.env.world_model
 
+    @property
+    def action_spec(self) -> Bounded:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Of the world model's actions, where the world model is now."""
+        return self.env.action_spec  # pyright: ignore[reportReturnType]
+
+    @action_spec.setter
+    def action_spec(self, spec: Bounded) -> None:
+        pass  # the base class copies that of the environment, which would stay behind when the planner is moved
+
+    @property
+    def spec(self) -> Composite:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Specs of all entries that :meth:`forward` writes; who asks for them need not try a plan."""
+        device, dtype = self.env.device_and_dtype()
+        action, one = torch.Size([self.world_model.action_dim]), torch.Size([1])
+        like = {"device": device, "dtype": dtype}
+        specs = {
+            self._written[0]: self.action_spec,
+            self.plan_keys[LOC]: Unbounded(action, **like),
+            self.plan_keys[SCALE]: Unbounded(action, **like),
+            self.plan_keys[VALUE]: Unbounded(one, **like),
+            self.plan_keys[VERSION]: Unbounded(one, device=device, dtype=torch.int64),
+            self.plan_keys[FALLBACK]: Binary(1, shape=one, device=device, dtype=torch.bool),
+            self.next_plan_mean_key: Unbounded(torch.Size([self.horizon, *action]), **like),
+        }
+        return Composite({key: specs[key] for key in self.out_keys}, device=device)
+
+    @spec.setter
+    def spec(self, spec: Composite) -> None:
+        pass  # the base class hands back what it has moved; the specs follow the world model
+
     def __getstate__(self) -> dict[str, Any]:
         # What was compiled is bound to this object: in a copy it would go on planning with the original's weights.
         return super().__getstate__() | {"compiled_plan": None}
+
+    def select_out_keys(self, *out_keys: NestedKey) -> EnsembleMPPIPlanner:
+        """Leaves only some of the entries that :meth:`forward` writes.
+
+        Raises:
+            ValueError: if one of them is not written at all.
+        """
+        keys = [unravel_key(key) for key in out_keys]
+        unknown = [key for key in keys if key not in self._written]
+        if unknown:
+            raise ValueError(f"out_keys must be some of {list(self._written)}, got {unknown}.")
+        self.out_keys = keys  # pyright: ignore[reportAttributeAccessIssue]
+        return self
+
+    def reset_out_keys(self) -> EnsembleMPPIPlanner:
+        """Takes back :meth:`select_out_keys`."""
+        self.out_keys = list(self._written)  # pyright: ignore[reportAttributeAccessIssue]
+        return self
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.extra_repr()}, world_model={type(self.world_model).__name__})"
+
+    def extra_repr(self) -> str:
+        """The budget and the choices, as they were given."""
+        budget = ("horizon", "num_samples", "num_elites", "num_proposals", "iterations", "discount")
+        choices = ("first_action", "eval_first_action", "warm_start")
+        parts = [f"{name}={getattr(self, name)!r}" for name in (*budget, *choices)]
+        return ", ".join([*parts, f"score={self.score!r}"])
 
     def make_tensordict_primer(self) -> PlanPrimer:
         """Transform that adds the warm start to an environment's reset and zeroes it there.
@@ -211,18 +270,23 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         Collectors find it by themselves (``auto_register_policy_transforms=True``). At the first reset it raises a
         ``ValueError`` where environment and model do not fit (:func:`~torchrl_etdmpc.envs.check_spaces`).
         """
-        spec = Unbounded(torch.Size([self.horizon, self.world_model.action_dim]))
-        keys = {"observation_key": self.observation_key, "action_key": self.out_keys[0]}
+        device, dtype = self.env.device_and_dtype()
+        spec = Unbounded(torch.Size([self.horizon, self.world_model.action_dim]), device=device, dtype=dtype)
+        keys = {"observation_key": self.observation_key, "action_key": self._written[0]}
         fits = {"spaces": model_sizes(self.world_model) | keys, "latent_key": self.latent_key}
         return PlanPrimer({self.plan_mean_key: spec}, default_value=0.0, expand_specs=True, **fits)
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """Plans and returns the action alone (the interface of TorchRL's planners)."""
-        return self(td.copy()).get(self.out_keys[0])
+        return self(td.copy()).get(self._written[0])
 
     @torch.no_grad()
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]  # the base class takes kwargs only to refuse them
-        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
+        self,
+        tensordict: TensorDictBase,
+        tensordict_out: TensorDictBase | None = None,
+        *,
+        generator: torch.Generator | None = None,
     ) -> TensorDictBase:
         """Plans for every state of the batch and writes action, target and warm start.
 
@@ -230,6 +294,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             tensordict (TensorDictBase): ``observation [..., O]`` or ``latent [..., L]``, and for the warm start
                 ``plan_mean [..., H, A]`` and ``is_init [..., 1]``, each optional.
             tensordict_out (TensorDictBase, optional): where to write. Default: ``tensordict``.
+
+        Keyword Args:
+            generator (torch.Generator, optional): of the plan's random numbers. Default: PyTorch's global one.
 
         Raises:
             KeyError: if neither an observation nor a latent is present.
@@ -251,9 +318,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         explore = exploration_type() is ExplorationType.RANDOM
         carried, carry = self._read_warm_start(tensordict)
         make_plan = self.plan if self.compiled_plan is None else self.compiled_plan
-        plan = make_plan(observation, carried, latent=latent, explore=explore)
+        drawn: dict[str, Any] = (
+            {} if generator is None else {"noise": self.draw_noise(*tensordict.batch_size, generator=generator)}
+        )
+        plan = make_plan(observation, carried, latent=latent, explore=explore, **drawn)
         outputs = {
-            self.out_keys[0]: plan.action,
+            self._written[0]: plan.action,
             self.plan_keys[LOC]: plan.loc,
             self.plan_keys[SCALE]: plan.scale,
             self.plan_keys[VALUE]: plan.value.unsqueeze(-1),
@@ -264,7 +334,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             outputs[self.next_plan_mean_key] = plan.mean
         out = tensordict if tensordict_out is None else tensordict_out
         for key, value in outputs.items():
-            out.set(key, value)
+            if key in self.out_keys:
+                out.set(key, value)
         return out
 
     def _read_warm_start(self, tensordict: TensorDictBase) -> tuple[Tensor | None, bool]:
@@ -306,7 +377,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             device, dtype = own_device if device is None else device, own_dtype if dtype is None else dtype
         actions = (self.horizon, self.world_model.action_dim)
         free = self.num_samples - self.num_proposals
-        options = {"generator": generator, "device": device, "dtype": dtype}
+        options: dict[str, Any] = {"device": device, "dtype": dtype}
+        if generator is not None:  # torch.randn(..., generator=None) takes no symbolic size
+            options["generator"] = generator
         return PlanNoise(
             proposals=torch.randn(*batch_size, self.num_proposals, *actions, **options),
             candidates=torch.randn(*batch_size, self.iterations, free, *actions, **options),

@@ -58,11 +58,28 @@ class LatentEnv(ModelBasedEnvBase):
         device, dtype = device_and_dtype(world_model, device, dtype)
         super().__init__(world_model, device=device)  # pyright: ignore[reportArgumentType]  # any module will do
         self.head = head
-        like = {"device": device, "dtype": dtype}
-        size = torch.Size([world_model.latent_dim])
-        self.observation_spec = Composite({LATENT: Unbounded(size, **like)})
-        self.state_spec = Composite({LATENT: Unbounded(size, **like)})
-        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([world_model.action_dim]), **like)
+        self._set_specs(device, dtype)
+
+    def _apply(self, fn: Any, *args: Any, **kwargs: Any) -> Any:
+        super()._apply(fn, *args, **kwargs)
+        device, dtype = self.device_and_dtype()
+        like = fn(torch.empty(0, device=device, dtype=dtype))  # where a model without parameters goes
+        device, dtype = device_and_dtype(self.world_model, like.device, like.dtype)
+        for specs in ("_input_spec", "_output_spec"):  # those of the flags too
+            if specs in vars(self):
+                vars(self)[specs] = vars(self)[specs].to(device)
+        self._set_specs(device, dtype)
+        return self
+
+    def _set_specs(self, device: torch.device, dtype: torch.dtype) -> None:
+        """Specs of a world model that is here, in this dtype."""
+        model, like = self.world_model, {"device": device, "dtype": dtype}
+        self._device = device
+        self.empty_cache()
+        size = torch.Size([model.latent_dim])
+        self.observation_spec = Composite({LATENT: Unbounded(size, **like)}, device=device)
+        self.state_spec = Composite({LATENT: Unbounded(size, **like)}, device=device)
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([model.action_dim]), **like)
         self.reward_spec = Unbounded(torch.Size([1]), **like)
 
     def device_and_dtype(self) -> tuple[torch.device, torch.dtype]:

@@ -91,6 +91,11 @@ class ReanalyzeTransform(Transform):
         self.stale = 0
         self.target_age: Tensor | None = None
 
+    def extra_repr(self) -> str:
+        """When it re-plans how much, and what it has done so far."""
+        names = ("slice_len", "interval", "num_slices", "enabled", "samples", "refreshed", "stale")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+
     def get_extra_state(self) -> dict[str, Any]:
         """The counts, as plain values and one tensor."""
         return {name: getattr(self, name) for name in _COUNTS}
