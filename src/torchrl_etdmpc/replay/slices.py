@@ -143,7 +143,8 @@ class StepSliceSampler(Sampler):
         if self.partial:
             # The last step again, so that what is masked is as finite and as far from zero as the rest.
             last = self._trajectories.lengths[chosen] - 1
-            info[self.mask_key] = torch.from_numpy((steps <= last).reshape(-1)).to(_device(storage))
+            valid = torch.from_numpy((steps <= last).reshape(-1)).to(_device(storage))
+            info[self.mask_key] = valid  # pyright: ignore[reportArgumentType]  # nested keys are fine
             steps = np.minimum(steps, last)
         rows = self._trajectories.rows(chosen, steps) % storage.max_size
         return torch.from_numpy(rows.reshape(-1)).to(_device(storage)), info
