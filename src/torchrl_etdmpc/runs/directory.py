@@ -99,9 +99,11 @@ class RunDirectory:
             first, _, rest = text.partition("\n")
             if first.startswith(_SEAL) and first != _SEAL + _digest(rest):
                 raise ValueError("it is not what the run wrote; settings are changed on the command line")
-            if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):  # few bytes can mean gigabytes
+            loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is there
+            events = yaml.parse(text, loader)
+            if any(isinstance(event, yaml.AliasEvent) for event in events):  # few bytes can mean gigabytes
                 raise ValueError("it refers to itself")
-            return yaml.safe_load(text)
+            return yaml.load(text, loader)
         except (yaml.YAMLError, UnicodeDecodeError, DamagedFileError, ValueError, RecursionError) as error:
             raise ValueError(f"{self.config} is not a configuration: {' '.join(str(error).split())}") from error
 
