@@ -162,7 +162,7 @@ REFUSED = [
     ("task=gym/Pendulm-v1", "unknown task 'gym/Pendulm-v1'; did you mean gym/Pendulum-v1, "),
     ("task=gym/CartPole-v1", "gym/CartPole-v1 has discrete actions (Discrete); only continuous actions are supported."),
     ("task=gym/Blackjack-v1", "Gymnasium sets no time limit for Blackjack-v1; give one in env steps: task.episode_"),
-    ("task=gym/Pendulum-v1 task.action_repeat=0", "action_repeat of task 'gym/Pendulum-v1' must be at least 1, got 0."),
+    ("task=gym/Pendulum-v1 task.action_repeat=0", "task.action_repeat of task 'gym/Pendulum-v1' must be at least 1"),
     ("task=gym/Pendulum-v1 task.episode_length=2", "loss.slice_len must fit into an episode of 2 decisions, got 3."),
     ("task=nowhere:make", "task 'nowhere:make': there is no module 'nowhere' on Python's path or in "),
     ("task=mymodule:nothing", "task 'mymodule:nothing': the module 'mymodule' ("),
@@ -173,11 +173,11 @@ REFUSED = [
     ("task=mymodule:make_unscaled", "task 'mymodule:make_unscaled': this environment cannot be used as it is: action"),
     (
         "task=mymodule:make_limited task.episode_length=500",
-        "episode_length of task 'mymodule:make_limited' must be at most 200, its environment's own limit, got 500.",
+        "task.episode_length of task 'mymodule:make_limited' must be at most 200, its environment's own limit, got ",
     ),
     (
         "task=mymodule:make_limited task.action_repeat=2",
-        "action_repeat of task 'mymodule:make_limited' must be 1, which is how often its environment repeats an action",
+        "task.action_repeat of task 'mymodule:make_limited' must be 1, which is how often its environment repeats ",
     ),
 ]
 

@@ -44,11 +44,14 @@ def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
 
 
 def as_typed(text: str) -> str:
-    """A message in the words of ``make``, if that is what was typed: its variables in the place of settings.
+    """A message in the words of the command line, or of ``make`` if that is what was typed.
 
     >>> as_typed("run_dir=runs/a already holds a run")
     'run_dir=runs/a already holds a run'
+    >>> as_typed("action_repeat of task 'walker-walk' must be at least 1, got 0.")
+    "task.action_repeat of task 'walker-walk' must be at least 1, got 0."
     """
+    text = re.sub(rf"^({'|'.join(TASK_SETTINGS)}) of task", r"task.\1 of task", text)
     if os.environ.get("TORCHRL_ETDMPC_MAKE") != "1":
         return text
     text = re.sub(r"\b(resume=\w+)", r'ARGS="\1"', text)
