@@ -113,7 +113,10 @@ def results(run_dir: Path) -> dict[str, Any]:
 
 
 def run_once(run_dir: Path, changes: Mapping[str, Any], stop: tuple[float, int] | None) -> tuple[int, str, float]:
-    """Exit code, what was printed, and seconds of one process, stopped after so many seconds by a signal."""
+    """Exit code, what was printed and seconds of one process, stopped after so many seconds by a signal.
+
+    What is printed ends with ``Orphans`` if processes that it started are still there after 15 seconds.
+    """
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "disable"}
     tick = time.monotonic()
     process = subprocess.Popen(
@@ -136,13 +139,13 @@ def run_once(run_dir: Path, changes: Mapping[str, Any], stop: tuple[float, int] 
         os.killpg(process.pid, signal.SIGKILL)
         text, _ = process.communicate()
         return 10_000, text, LIMIT_S
-    return process.returncode, text, time.monotonic() - tick
-
-
-def orphans(run_dir: Path) -> list[int]:
-    """Processes of the run's session that outlived it."""
-    found = subprocess.run(["pgrep", "-f", str(run_dir)], capture_output=True, text=True, check=False).stdout.split()
-    return [int(number) for number in found]
+    seconds = time.monotonic() - tick
+    for _ in range(15):  # the environments' processes go within ten seconds
+        session = subprocess.run(["pgrep", "-s", str(process.pid)], capture_output=True, text=True, check=False).stdout
+        if not session:
+            return process.returncode, text, seconds
+        time.sleep(1)
+    return process.returncode, f"{text}\nOrphans: {session.split()}", seconds
 
 
 class Complaints(list[str]):
@@ -177,14 +180,10 @@ def kills(number: int, seed: int, folder: Path) -> dict[str, Any]:
                 code, text, _ = run_once(run_dir, changes, stop)
                 codes[signal.Signals(-code).name if code < 0 else str(code)] += 1
                 what = f"{kind}, series {series}, attempt {attempt}, {stop}, code {code}"
-                if "Traceback" in text or code not in EXPECTED or "Exception ignored" in text:
+                bad = any(word in text for word in ("Traceback", "Exception ignored", "Orphans"))
+                if bad or code not in EXPECTED:
                     complaints.append(f"{what}: {text[-2000:]}")
                 done[kind] += stop is not None and code != 0
-                left = orphans(run_dir)
-                if left:
-                    time.sleep(15)  # the environments' processes go within ten seconds
-                    if orphans(run_dir):
-                        complaints.append(f"{what}: processes stay: {orphans(run_dir)}")
                 if code == 0:
                     break
             try:

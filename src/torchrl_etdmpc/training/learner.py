@@ -137,6 +137,12 @@ class Learner:
         row: dict[str, Any] = self._updates.means()
         self._check_updates(row)
         row |= {"episode_return": math.nan} | self._decisions.means()
+        if row.get("plan_fallbacks") == 1:
+            warnings.warn(
+                "no plan since the last row of train.csv had finite scores, so the policy acted in their place; a lower "
+                "planner.beta, optim.lr or optim.grad_clip_norm may help.",
+                stacklevel=2,
+            )
         row |= {"simulator_faults": self.faults, "updates_skipped": int(self.agent.updater.skipped)}
         if self.reanalyze is not None:
             row.setdefault("target_age", math.nan)
