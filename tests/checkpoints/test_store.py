@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
 
-from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, DamagedBufferError
 
 
 class Counter:
@@ -416,7 +416,7 @@ def test_weights_and_what_is_left_of_the_buffer_are_restored_on_request(store):
         save(store, step, work.do())
     rows = json.loads((store.folder / "resume" / f"{5:012d}" / "manifest.json").read_text())["replay"]["rows"]
     damage(store.folder / "replay" / rows[1]["file"], "a flipped bit")
-    with pytest.raises(CheckpointError, match="is not the file that was written"):
+    with pytest.raises(DamagedBufferError, match="is not the file that was written"):
         load(store.folder)
     again = Work()
     other = CheckpointStore(store.folder)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+collect_ignore = ["script.py"]  # no test, and nothing to import
 ROOT = Path(__file__).resolve().parents[2]
 FORKS = multiprocessing.get_context("forkserver")
 IMPORTS = (

@@ -41,6 +41,10 @@ class CheckpointError(RuntimeError):
     """A file that cannot be used as a checkpoint, and why."""
 
 
+class DamagedBufferError(CheckpointError):
+    """No checkpoint is whole, but of at least one it is only the buffer that is damaged."""
+
+
 class Part(Protocol):
     """Anything that owns a state."""
 
@@ -141,12 +145,14 @@ class CheckpointStore:
             Path: the checkpoint's folder.
 
         Raises:
-            CheckpointError: if there is none; its text says what is wrong with each.
+            CheckpointError: if there is none; its text says what is wrong with each. It is a
+                :class:`DamagedBufferError` where :meth:`salvage` may help.
         """
-        faults = []
+        faults, kind = [], CheckpointError
         for folder in reversed(self._folders()):
             try:
                 states, manifest = self._read(folder, parts)
+                kind = DamagedBufferError
                 self.journal.load(buffer, manifest["replay"])
             except (DamagedFileError, CheckpointError) as error:
                 faults.append(str(error).rstrip("."))
@@ -155,7 +161,7 @@ class CheckpointStore:
             for fault in faults:
                 warnings.warn(f"going on from {folder}, because {fault}.", stacklevel=2)
             return folder
-        raise CheckpointError(f"cannot resume: {self._reason(faults)}.")
+        raise kind(f"cannot resume: {self._reason(faults)}.")
 
     def salvage(self, parts: Mapping[str, Part], buffer: TensorDictReplayBuffer) -> Path:
         """Restores parts from the newest checkpoint whose parts are whole, and what is left of its buffer.

@@ -14,7 +14,7 @@ from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 
-from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, Part
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, DamagedBufferError, Part
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
 from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent
@@ -106,10 +106,10 @@ class TrainingRun:
         """
         try:
             folder = self.store.load(self.parts, self.learner.replay)
-        except CheckpointError as error:
+        except DamagedBufferError as error:
             if self.config.resume != "weights":
                 raise CheckpointError(
-                    f"{error} If the weights are whole, resume=weights goes on with what is left of the buffer."
+                    f"{error} resume=weights goes on with the weights and what is left of the buffer."
                 ) from error
             folder = self._salvage()
         self._saved_step = self.env_steps
