@@ -51,6 +51,20 @@ def test_the_exported_planner_plans_like_the_live_one_and_draws_new_noise(states
     assert not torch.equal(program(observation, plan_mean)[1], mean)
 
 
+@pytest.mark.parametrize("make", [lambda: make_model(termination=True), lambda: LineWorld(action_dim=5)])
+def test_one_exported_planner_plans_for_any_number_of_states(make):
+    planner = make_planner(make())
+    program = export_planner(planner, batch_size=None).module()
+    for states in (1, 2, 7):
+        observation, plan_mean = torch.randn(states, 5), torch.rand(states, 3, planner.world_model.action_dim) * 2 - 1
+        torch.manual_seed(1)
+        action, mean = program(observation, plan_mean)
+        torch.manual_seed(1)
+        plan = planner.plan(observation, plan_mean, explore=False)
+        torch.testing.assert_close(action, plan.action)
+        torch.testing.assert_close(mean, plan.mean)
+
+
 def test_a_compiled_plan_is_not_what_is_exported():
     planner = make_planner(make_model())
 

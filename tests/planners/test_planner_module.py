@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch._dynamo.testing import CompileCounter
+from torchrl.collectors import Collector
 
 from torchrl_etdmpc import Plan
 from torchrl_etdmpc.planners import PlanNoise
@@ -47,6 +48,18 @@ def test_a_copy_plans_with_weights_of_its_own(make_planner, states, assert_same_
             for weight in other.parameters():
                 weight.mul_(2)
     assert_same_plan(planner.plan(observation, noise=noise), before)
+
+
+def test_a_planner_that_a_collector_held_is_pickled(make_planner, make_model):
+    planner = make_planner(make_model().float())
+    collector = Collector(
+        planner.env, planner, frames_per_batch=2, total_frames=2, auto_register_policy_transforms=True
+    )
+    next(iter(collector))
+    collector.shutdown()
+    other = pickle.loads(pickle.dumps(planner))
+    assert other.env.collector is None
+    assert other.env.rollout(2).shape == (2,)
 
 
 @pytest.mark.parametrize("convert", [lambda planner: planner.double(), lambda planner: planner.to(torch.float64)])

@@ -516,3 +516,11 @@ def test_numbers_below_one_are_refused(name):
     arguments = {"slice_len": 3, "interval": 1, "num_slices": 1} | {name: 0}
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
         ReanalyzeTransform(CountingPlanner(), **arguments)
+
+
+def test_the_repr_says_what_is_re_planned_and_what_was():
+    buffer = make_buffer(12)
+    reanalyze = make_reanalyze(buffer, interval=2)
+    assert "slice_len=3, interval=2, num_slices=2, enabled=True, samples=0, refreshed=0, stale=0" in repr(reanalyze)
+    buffer.sample(), buffer.sample()
+    assert "samples=2, refreshed=6, stale=0" in repr(reanalyze)

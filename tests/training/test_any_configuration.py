@@ -77,6 +77,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
                 "pretrain_updates": st.integers(0, 2),
                 "capacity": st.integers(8, 60),
                 "uniform_over": st.sampled_from(["episodes", "starts"]),
+                "partial": st.booleans(),
             }
         ),
     }

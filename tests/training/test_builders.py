@@ -77,6 +77,11 @@ def test_a_sample_is_a_batch_of_slices(tiny_config):
     assert replay.writer.tracks_generations
 
 
+def test_slices_may_begin_in_the_last_steps_of_an_episode_if_asked(tiny_config):
+    assert not build_replay(tiny_config()).sampler.partial
+    assert build_replay(tiny_config(replay={"partial": True})).sampler.partial
+
+
 @pytest.mark.parametrize(("updates", "every", "interval"), [(1, 10, 10), (2, 5, 10), (4, 2, 8)])
 def test_the_reanalyze_interval_counts_decisions(updates, every, interval, tiny_config):
     # Reanalyze counts samples, and there is one per update.

@@ -113,6 +113,7 @@ UTD4 = {
     "replay.capacity": 1_000_000,
     "replay.insertion": "step",
     "replay.uniform_over": "episodes",
+    "replay.partial": False,
     "replay.device": "auto",
     "replay.seed_decisions": None,  # max(1000, 5 episodes)
     "replay.pretrain_updates": None,  # as many as seed decisions

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -18,13 +18,16 @@ class PredictionModel(Protocol):
     :class:`~torchrl_etdmpc.modules.WorldModel` is the learned one; :mod:`torchrl_etdmpc.testing` has exact ones, which
     are short to read. The losses train the networks of a ``WorldModel`` and need more than this.
 
+    A model with a policy has ``policy`` and ``act`` as well (:class:`PolicyModel`), from which the planner takes its
+    proposals; without one it is driven with ``num_proposals=0``.
+
     >>> from torchrl_etdmpc.testing import LineWorld
     >>> isinstance(LineWorld(), PredictionModel)
     True
     """
 
-    observation_dim: int
-    """O, size of the flat observation."""
+    observation_dim: int | None
+    """O, size of the flat observation. ``None``: the model encodes what it likes, e.g. images or a dictionary."""
     action_dim: int
     """A; every action lies in [-1, 1]."""
     latent_dim: int
@@ -35,8 +38,12 @@ class PredictionModel(Protocol):
     """How many updates made these weights: a scalar, int64. It is stamped on every target; a model that is not trained
     has a zero."""
 
-    def encode(self, observation: Tensor) -> Tensor:
-        """Observation ``[..., O]`` to latent ``[..., L]``."""
+    def encode(self, observation: Any) -> Tensor:
+        """Observation ``[..., O]`` to latent ``[..., L]``.
+
+        What an observation is beyond its leading batch is the model's business: a tensor of any shape and dtype, or a
+        ``TensorDict`` of them with the batch size ``[...]``.
+        """
         ...
 
     def next(self, latent: Tensor, action: Tensor) -> Tensor:
@@ -67,6 +74,11 @@ class PredictionModel(Protocol):
         """
         ...
 
+
+@runtime_checkable
+class PolicyModel(PredictionModel, Protocol):
+    """A :class:`PredictionModel` with a policy, which proposes to the planner and can act alone."""
+
     def policy(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of the policy in ``latent [..., L]``, both of shape ``[..., A]``.
 
@@ -84,13 +96,41 @@ class PredictionModel(Protocol):
         ...
 
 
+def has_policy(model: object) -> TypeGuard[PolicyModel]:
+    """Whether a model has a policy, which is more than planning needs.
+
+    >>> has_policy(torch.nn.Linear(2, 2))
+    False
+    """
+    return any(getattr(model, name, None) is not None for name in _POLICY)
+
+
+def require_policy(model: PredictionModel, what: str) -> PolicyModel:
+    """The model, if it has a policy.
+
+    Args:
+        model (PredictionModel): any.
+        what (str): who needs one, for the message.
+
+    Raises:
+        TypeError: if it has none.
+    """
+    if not has_policy(model):
+        raise TypeError(f"{what} needs a model with a policy, got {type(model).__name__} without policy and act.")
+    return model
+
+
+_POLICY = ("policy", "act")
+
+
 def require_prediction_model(model: object) -> None:
-    """Checks that an object is a module with every member of :class:`PredictionModel`.
+    """Checks that an object is a module with every member of :class:`PredictionModel`; with a policy, of its too.
 
     Raises:
         TypeError: naming what is missing.
     """
-    members = (*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_")))
+    members = [*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_"))]
+    members += _POLICY if has_policy(model) else ()
     missing = [name for name in members if not hasattr(model, name)]
     if missing:
         raise TypeError(

@@ -7,17 +7,21 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_etdmpc.keys import ACTION, OBSERVATION
-from torchrl_etdmpc.modules import PredictionModel
+from torchrl_etdmpc.modules import PolicyModel
+from torchrl_etdmpc.modules.prediction import require_policy
 
 
 class BarePolicy(TensorDictModuleBase):
     """The policy network without the planner: acts with its mean.
 
     Args:
-        world_model (PredictionModel): encoder and policy.
+        world_model (PolicyModel): encoder and policy.
 
     Keyword Args:
         observation_key, action_key (NestedKey): tensordict keys.
+
+    Raises:
+        TypeError: if the model has no policy.
 
     >>> from tensordict import TensorDict
     >>> from torchrl_etdmpc.modules import WorldModel
@@ -28,13 +32,13 @@ class BarePolicy(TensorDictModuleBase):
 
     def __init__(
         self,
-        world_model: PredictionModel,
+        world_model: PolicyModel,
         *,
         observation_key: NestedKey = OBSERVATION,
         action_key: NestedKey = ACTION,
     ) -> None:
         super().__init__()
-        self.world_model = world_model
+        self.world_model = require_policy(world_model, "BarePolicy")
         self.in_keys = [observation_key]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [action_key]  # pyright: ignore[reportAttributeAccessIssue]
 

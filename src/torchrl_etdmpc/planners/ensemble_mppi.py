@@ -42,7 +42,7 @@ from torchrl_etdmpc.keys import (
     VALUE,
     VERSION,
 )
-from torchrl_etdmpc.modules.prediction import PredictionModel
+from torchrl_etdmpc.modules.prediction import PredictionModel, has_policy
 from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
@@ -77,7 +77,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         num_samples (int): N, candidates per iteration, proposals included. Default: 512.
         num_elites (int): K. Default: 64.
         num_proposals (int): P, sequences proposed by the policy, spread over the dynamics heads round-robin. They are
-            scored once per call. Default: 24.
+            scored once per call. 0 for a model without a policy. Default: 24.
         iterations (int): Default: 6.
         extra_iterations (int): added if the action has more than ``large_action_dim`` dimensions. Default: 2.
         large_action_dim (int): Default: 20.
@@ -110,7 +110,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     Raises:
         TypeError: if ``env`` is not a :class:`LatentEnv`.
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or proposals are asked of a model without a policy.
 
     >>> from tensordict import TensorDict
     >>> from torchrl_etdmpc.modules import WorldModel
@@ -158,6 +158,11 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 "LatentEnv(world_model)."
             )
         _check_budget(horizon, num_samples, num_elites, num_proposals, iterations, extra_iterations)
+        if num_proposals and not has_policy(env.world_model):
+            raise ValueError(
+                f"num_proposals must be 0 for a model without a policy ({type(env.world_model).__name__}), got "
+                f"{num_proposals}."
+            )
         _check_fit(discount, inverse_temperature, std_min, std_max)
         for name, choice in {"first_action": first_action, "eval_first_action": eval_first_action}.items():
             if choice not in get_args(FirstAction):
@@ -467,16 +472,23 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     def _proposals(self, latent: Tensor, noise: Tensor) -> Tensor:
         """The policy's sequences ``[B, P, H, A]``."""
-        if not self.num_proposals:
+        if not self.num_proposals or not has_policy(self.world_model):
             return noise
         return propose_sequences(self.world_model, latent, noise, self.proposal_log_std_bounds)
 
     def _target(self, latent: Tensor, search: _Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean ``[B, A]``, standard deviation ``[B, A]`` and value ``[B]`` of the target; on fallback the policy's."""
+        """Mean ``[B, A]``, standard deviation ``[B, A]`` and value ``[B]`` of the target.
+
+        On fallback mean and standard deviation are the policy's; without a policy, those of the last Gaussian that was
+        fitted to finite scores, which is the warm start where there was none.
+        """
         loc, value = self._choose(search, uniform, explore)
-        policy_mean, policy_log_std = self.world_model.policy(latent)
-        policy_std = policy_log_std.exp().clamp(self.std_min, self.std_max)
         fallback = search.fallback
+        if has_policy(self.world_model):
+            policy_mean, policy_log_std = self.world_model.policy(latent)
+            policy_std = policy_log_std.exp().clamp(self.std_min, self.std_max)
+        else:
+            policy_mean, policy_std = search.gaussian.mean[:, 0], search.gaussian.std[:, 0]
         loc = torch.where(fallback.unsqueeze(-1), policy_mean, loc)
         scale = torch.where(fallback.unsqueeze(-1), policy_std, search.gaussian.std[:, 0])
         return loc, scale, torch.where(fallback, torch.nan, value)

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-from torchrl_etdmpc.modules.prediction import PredictionModel, device_and_dtype
+from torchrl_etdmpc.modules.prediction import PolicyModel, PredictionModel, device_and_dtype, require_policy
 from torchrl_etdmpc.planners.ensemble_mppi import EnsembleMPPIPlanner
 
 
 class _Policy(nn.Module):
-    def __init__(self, world_model: PredictionModel) -> None:
+    def __init__(self, world_model: PolicyModel) -> None:
         super().__init__()
         self.world_model = world_model
 
@@ -33,28 +33,38 @@ class _Planner(nn.Module):
         return plan.action, plan.mean
 
 
-def export_policy(world_model: PredictionModel) -> ExportedProgram:
+def export_policy(world_model: PolicyModel, *, observation: Tensor | None = None) -> ExportedProgram:
     """The policy without the planner: ``observation [B, O] -> action [B, A]``, any B.
 
     The action is the policy's mean, in [-1, 1]. The program holds copies of the weights that it needs and no others.
 
     Args:
-        world_model (PredictionModel): encoder and policy, an ``nn.Module``.
+        world_model (PolicyModel): encoder and policy, an ``nn.Module``.
+
+    Keyword Args:
+        observation (Tensor, optional): an example ``[...]`` of one observation, for a model whose observations are no
+            vectors. Default: zeros ``[O]``.
 
     Returns:
         ExportedProgram: for ``torch.export.save``; to run it, ``torch.export.load(file).module()(observation)``.
+
+    Raises:
+        TypeError: if the model has no policy.
+        ValueError: if an example is needed.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> program = export_policy(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
     >>> program.module()(torch.zeros(5, 3)).shape
     torch.Size([5, 2])
     """
-    device, dtype = device_and_dtype(world_model)
-    example = torch.zeros(2, world_model.observation_dim, device=device, dtype=dtype)
-    return _export(_Policy(world_model), example, dynamic_shapes={"observation": {0: Dim("batch")}})
+    policy = _Policy(require_policy(world_model, "export_policy"))
+    example = _observations(world_model, observation, 2, *device_and_dtype(world_model))
+    return _export(policy, example, dynamic_shapes={"observation": {0: Dim("batch")}})
 
 
-def export_planner(planner: EnsembleMPPIPlanner, *, batch_size: int = 1) -> ExportedProgram:
+def export_planner(
+    planner: EnsembleMPPIPlanner, *, batch_size: int | None = 1, observation: Tensor | None = None
+) -> ExportedProgram:
     """The planner as it evaluates: ``observation [B, O], plan_mean [B, H, A] -> action [B, A], plan_mean [B, H, A]``.
 
     ``plan_mean`` is the warm start: zeros at the beginning of an episode, then what the call before returned. The
@@ -65,21 +75,42 @@ def export_planner(planner: EnsembleMPPIPlanner, *, batch_size: int = 1) -> Expo
         planner (EnsembleMPPIPlanner): with its world model.
 
     Keyword Args:
-        batch_size (int): B, which is fixed. Default: 1.
+        batch_size (int, optional): B, which is fixed; ``None`` for a program that takes any number of states.
+            Default: 1.
+        observation (Tensor, optional): as of :func:`export_policy`.
 
     Returns:
         ExportedProgram: for ``torch.export.save``.
 
     Raises:
-        ValueError: if ``batch_size`` is below 1.
+        ValueError: if ``batch_size`` is below 1, or an example is needed.
     """
-    if batch_size < 1:
+    if batch_size is not None and batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
     model = planner.world_model
     device, dtype = planner.env.device_and_dtype()
-    observation = torch.zeros(batch_size, model.observation_dim, device=device, dtype=dtype)
-    plan_mean = torch.zeros(batch_size, planner.horizon, model.action_dim, device=device, dtype=dtype)
-    return _export(_Planner(planner), observation, plan_mean)
+    states = 2 if batch_size is None else batch_size
+    inputs = (
+        _observations(model, observation, states, device, dtype),
+        torch.zeros(states, planner.horizon, model.action_dim, device=device, dtype=dtype),
+    )
+    if batch_size is not None:
+        return _export(_Planner(planner), *inputs)
+    batch = Dim("batch")
+    return _export(_Planner(planner), *inputs, dynamic_shapes={"observation": {0: batch}, "plan_mean": {0: batch}})
+
+
+def _observations(
+    model: PredictionModel, example: Tensor | None, states: int, device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    if example is not None:
+        return example.to(device).expand(states, *example.shape).contiguous()
+    if model.observation_dim is None:
+        raise ValueError(
+            f"observation must be given for {type(model).__name__}, whose observations are no vectors; pass "
+            "observation=env.reset()['observation']."
+        )
+    return torch.zeros(states, model.observation_dim, device=device, dtype=dtype)
 
 
 @torch.no_grad()

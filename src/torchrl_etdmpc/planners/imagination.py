@@ -7,16 +7,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrl_etdmpc.functional import return_table
-from torchrl_etdmpc.modules.prediction import PredictionModel
+from torchrl_etdmpc.modules.prediction import PolicyModel, PredictionModel
 
 
 def propose_sequences(
-    world_model: PredictionModel, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None
+    world_model: PolicyModel, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None
 ) -> Tensor:
     """Rolls the policy; proposal p is rolled with dynamics head p mod F.
 
     Args:
-        world_model (PredictionModel): policy and dynamics.
+        world_model (PolicyModel): policy and dynamics.
         latent (Tensor): states, ``[B, L]``.
         noise (Tensor): standard normal draws for the policy, ``[B, P, H, A]``.
         log_std_bounds (tuple of float, optional): of the policy's log std. Default: the policy's own.
@@ -84,7 +84,7 @@ def _rewards_along(world_model: PredictionModel, latent: Tensor, latents: list[T
     rows += [later.flatten(0, -2) for later in latents[:-1]]
     tried = [steps[0].flatten(0, 1), steps[1:].unsqueeze(1).expand(-1, heads, -1, -1, -1).flatten(0, -2)]
     rewards = world_model.reward(torch.cat(rows), torch.cat(tried))
-    first, later = rewards.split([states * candidates, len(rewards) - states * candidates])
+    first, later = rewards[: states * candidates], rewards[states * candidates :]
     return torch.cat(
         [
             first.view(1, 1, states, candidates).expand(1, heads, -1, -1),

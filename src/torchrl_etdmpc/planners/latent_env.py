@@ -82,18 +82,28 @@ class LatentEnv(ModelBasedEnvBase):
         self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([model.action_dim]), **like)
         self.reward_spec = Unbounded(torch.Size([1]), **like)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A collector leaves a weak reference to itself, which cannot be pickled and is not the copy's collector.
+        return {**super().__getstate__(), "_collector": None}  # pyright: ignore[reportGeneralTypeIssues]
+
     def device_and_dtype(self) -> tuple[torch.device, torch.dtype]:
         """Where observations and latents go now: those of the world model, which may have been moved or cast."""
         spec = self.observation_spec[LATENT]
         return device_and_dtype(self.world_model, spec.device, spec.dtype)  # pyright: ignore[reportArgumentType]
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
-        """Starts from ``latent`` or encodes ``observation`` if given; from an all-zero observation otherwise."""
+        """Starts from ``latent`` or encodes ``observation`` if given; from an all-zero observation otherwise.
+
+        A model that encodes what it likes starts from an all-zero latent then.
+        """
         model = self.world_model
         if tensordict is None or (LATENT not in tensordict.keys() and OBSERVATION not in tensordict.keys()):
             batch_size = self.batch_size if tensordict is None else tensordict.batch_size
             device, dtype = self.device_and_dtype()
-            latent = model.encode(torch.zeros(*batch_size, model.observation_dim, device=device, dtype=dtype))
+            if model.observation_dim is None:
+                latent = torch.zeros(*batch_size, model.latent_dim, device=device, dtype=dtype)
+            else:
+                latent = model.encode(torch.zeros(*batch_size, model.observation_dim, device=device, dtype=dtype))
         elif LATENT in tensordict.keys():
             batch_size, latent = tensordict.batch_size, tensordict.get(LATENT)
         else:

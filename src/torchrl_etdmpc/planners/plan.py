@@ -49,6 +49,7 @@ class Plan(NamedTuple):
     mean: Tensor
     """Mean of the last iteration, the next call's warm start, ``[..., H, A]``."""
     fallback: Tensor
-    """Whether no candidate of the last iteration had a finite score, so that the policy acted instead, ``[...]``."""
+    """Whether no candidate of the last iteration had a finite score, ``[...]``: the policy acted instead, or, where
+    there is none, the last plan with finite scores, which may be the warm start."""
     trace: PlanTrace | None
     """Every iteration, if asked for."""

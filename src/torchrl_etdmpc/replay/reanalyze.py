@@ -91,6 +91,9 @@ class ReanalyzeTransform(Transform):
         self.stale = 0
         self.target_age: Tensor | None = None
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.extra_repr()})"  # the base class shows keys, which it has none of
+
     def extra_repr(self) -> str:
         """When it re-plans how much, and what it has done so far."""
         names = ("slice_len", "interval", "num_slices", "enabled", "samples", "refreshed", "stale")

@@ -141,6 +141,9 @@ class ReplayConfig:
     """Whether a transition can be sampled at once or after its episode."""
     uniform_over: UniformOver = "episodes"
     """Whether a slice is drawn by its episode first, which favours the running one, or from all alike."""
+    partial: bool = False
+    """Whether a slice may also begin in the last steps of an ended episode; what is beyond the end counts for
+    nothing."""
     device: Literal["auto", "cpu", "run"] = "auto"
     """Where the storage lives: ``cpu``; ``run``, the run's device; ``auto``, the run's device if the full buffer takes
     at most half of its free memory."""

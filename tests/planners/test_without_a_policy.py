@@ -1,0 +1,75 @@
+"""A model without a policy: what plans over it, what the fallback is, and what says that it needs one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, PredictionModel, export_planner, export_policy
+from torchrl_etdmpc.modules import PolicyModel
+from torchrl_etdmpc.planners import BarePolicy
+
+START = {"horizon": 2, "num_samples": 64, "num_elites": 8, "num_proposals": 0, "iterations": 4, "warm_start": False}
+
+
+class Line(nn.Module):
+    """A point that actions push; best is to stand at 1."""
+
+    observation_dim = action_dim = latent_dim = num_dynamics = 1
+    version = torch.zeros((), dtype=torch.int64)
+
+    def __init__(self, reward: float = 0.0) -> None:
+        super().__init__()
+        self.bonus = reward
+
+    def encode(self, observation: Tensor) -> Tensor:
+        return observation
+
+    def next(self, latent: Tensor, action: Tensor) -> Tensor:
+        return latent + 0.5 * action
+
+    def reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return self.bonus - (latent + 0.5 * action - 1).square().sum(-1)
+
+    def values(self, latent: Tensor) -> Tensor:
+        return torch.zeros_like(latent)
+
+    def termination(self, latent: Tensor) -> Tensor | None:
+        return None
+
+
+def make_planner(world: Line, **options) -> EnsembleMPPIPlanner:
+    torch.manual_seed(0)
+    return EnsembleMPPIPlanner(LatentEnv(world), **(START | options))
+
+
+def test_a_policy_is_no_part_of_what_planning_needs():
+    assert isinstance(Line(), PredictionModel)
+    assert not isinstance(Line(), PolicyModel)
+
+
+def test_the_planner_finds_the_optimum_without_proposals():
+    planner = make_planner(Line())
+    state = TensorDict({"observation": torch.tensor([[0.0], [0.8], [1.25]])}, [3])
+    torch.testing.assert_close(planner(state)["plan", "loc"], torch.tensor([[1.0], [0.4], [-0.5]]), atol=0.15, rtol=0)
+    export_planner(planner, batch_size=None)
+
+
+def test_the_fallback_is_the_plan_that_was_carried():
+    planner, carried = make_planner(Line(torch.nan)), torch.tensor([[[0.9], [0.25]]])
+    plan = planner.plan(torch.zeros(1, 1), carried, explore=False)
+    assert plan.fallback.all() and plan.value.isnan().all()
+    assert plan.action.item() == plan.loc.item() == 0.25  # of the step after
+    assert plan.scale.item() == planner.std_max
+    assert planner.plan(torch.zeros(1, 1), explore=False).action.item() == 0
+
+
+def test_what_needs_a_policy_says_so():
+    with pytest.raises(ValueError, match=r"^num_proposals must be 0 for a model without a policy \(Line\), got 24\.$"):
+        EnsembleMPPIPlanner(LatentEnv(Line()))
+    message = r" needs a model with a policy, got Line without policy and act\.$"
+    for name, needy in {"BarePolicy": BarePolicy, "export_policy": export_policy}.items():
+        with pytest.raises(TypeError, match=f"^{name}{message}"):
+            needy(Line())
