@@ -524,3 +524,14 @@ def test_the_repr_says_what_is_re_planned_and_what_was():
     assert "slice_len=3, interval=2, num_slices=2, enabled=True, samples=0, refreshed=0, stale=0" in repr(reanalyze)
     buffer.sample(), buffer.sample()
     assert "samples=2, refreshed=6, stale=0" in repr(reanalyze)
+
+
+def test_a_sample_that_comes_as_slices_is_refreshed_like_a_flat_one():
+    results = []
+    for as_slices in (False, True):
+        torch.manual_seed(0)
+        buffer = make_buffer(12, sampler=StepSliceSampler(SLICE_LEN, as_slices=as_slices))
+        reanalyze = make_reanalyze(buffer)
+        results.append((buffer.sample().reshape(-1), buffer.storage[:].clone(), reanalyze.refreshed))
+    (flat, stored, count), (shaped, stored_too, count_too) = results
+    assert (flat == shaped).all() and (stored == stored_too).all() and count == count_too == 6

@@ -712,3 +712,22 @@ def test_a_storage_that_is_no_flat_tensor_storage_is_refused(storage):
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         StepSliceSampler(**arguments)
+
+
+@pytest.mark.parametrize("partial", [False, True])
+def test_a_sample_can_have_the_shape_that_the_losses_take(partial):
+    samples = []
+    for as_slices in (False, True):
+        torch.manual_seed(0)
+        sampler = StepSliceSampler(3, partial=partial, as_slices=as_slices)
+        writer = TensorDictRoundRobinWriter(track_generations=True)
+        buffer = TensorDictReplayBuffer(LazyTensorStorage(30), sampler=sampler, writer=writer, batch_size=12)
+        done = torch.arange(20).remainder(5).eq(4).unsqueeze(-1)
+        ids = {"traj_ids": torch.arange(20) // 5}
+        buffer.extend(TensorDict({"t": torch.arange(20), "next": {"done": done}, "collector": ids}, [20]))
+        samples.append(buffer.sample())
+    flat, shaped = samples
+    assert shaped.shape == (4, 3)
+    assert set(flat.keys(True, True)) == set(shaped.keys(True, True)) >= {"index", "index_generation"}
+    assert (flat.reshape(4, 3) == shaped).all()
+    assert "as_slices=True" in repr(sampler)

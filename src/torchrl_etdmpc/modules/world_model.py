@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +11,8 @@ from torchrl_etdmpc.functional import clipped_sample, two_hot_decode
 from torchrl_etdmpc.modules.dynamics import DynamicsEnsemble
 from torchrl_etdmpc.modules.encoder import Encoder
 from torchrl_etdmpc.modules.heads import RewardHead, TerminationHead, ValueEnsemble
-from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
+from torchrl_etdmpc.modules.new_weights import draw_new_weights
+from torchrl_etdmpc.modules.normed_linear import Activation
 from torchrl_etdmpc.modules.policy import GaussianPolicy
 
 
@@ -26,7 +26,7 @@ class WorldModel(nn.Module):
     first, ``[F, ..., L]``.
 
     Args:
-        observation_dim (int): O, size of the flat observation.
+        observation_dim (int, optional): O, size of the flat observation; ``None`` with an encoder of one's own.
         action_dim (int): A.
         latent_dim (int): L, a multiple of ``simnorm_dim``.
         mlp_dim (int): hidden size of dynamics, reward, value, policy and termination.
@@ -43,6 +43,10 @@ class WorldModel(nn.Module):
         log_std_max (float): largest log standard deviation of the policy.
         activation (str): ``"mish"``, ``"silu"`` or ``"relu"``.
         termination (bool): whether to build a termination head. Default: ``False`` (DMC never terminates).
+        encoder (nn.Module, optional): an encoder of one's own, which owns its input: from whatever the observation is,
+            with any leading batch, to the latent ``[..., L]``. The predictions are in the range of SimNorm (groups of
+            ``simnorm_dim`` that sum to 1), so the encoder should end with it. Default: an
+            :class:`~torchrl_etdmpc.modules.Encoder` of vectors.
 
     Raises:
         ValueError: if an argument is out of range, or L is not a multiple of ``simnorm_dim``.
@@ -58,7 +62,7 @@ class WorldModel(nn.Module):
 
     def __init__(
         self,
-        observation_dim: int,
+        observation_dim: int | None,
         action_dim: int,
         *,
         latent_dim: int = 512,
@@ -76,10 +80,13 @@ class WorldModel(nn.Module):
         log_std_max: float = 1.0,
         activation: Activation = "mish",
         termination: bool = False,
+        encoder: nn.Module | None = None,
     ) -> None:
         super().__init__()
+        if observation_dim is None and encoder is None:
+            raise ValueError("observation_dim must be given, got None; or pass an encoder that owns its input.")
         sizes = {
-            "observation_dim": observation_dim,
+            "observation_dim": 1 if observation_dim is None else observation_dim,
             "action_dim": action_dim,
             "latent_dim": latent_dim,
             "mlp_dim": mlp_dim,
@@ -111,8 +118,8 @@ class WorldModel(nn.Module):
         self.latent_dim = latent_dim
         self.num_dynamics = num_dynamics
         self.num_values = num_values
-        self.encoder = Encoder(
-            observation_dim,
+        self.encoder = encoder or Encoder(
+            sizes["observation_dim"],
             latent_dim,
             hidden_dim=encoder_dim,
             num_layers=encoder_layers,
@@ -155,12 +162,12 @@ class WorldModel(nn.Module):
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights in every network (the hook that TorchRL's losses call)."""
-        for network in cast("Iterator[LayerStack]", self.children()):
-            network.reset_parameters_recursive()
+        for network in self.children():
+            draw_new_weights(network)
         self.version.zero_()
 
-    def encode(self, observation: Tensor) -> Tensor:
-        """Observation ``[..., O]`` to latent ``[..., L]``."""
+    def encode(self, observation: Any) -> Tensor:
+        """Observation ``[..., O]``, or whatever the encoder takes with a leading batch, to latent ``[..., L]``."""
         return self.encoder(observation)
 
     def next(self, latent: Tensor, action: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey
@@ -15,10 +15,11 @@ from torchrl_etdmpc.modules import WorldModel
 class Slices(NamedTuple):
     """Replayed slices, time first. Fields that a loss does not read are ``None``."""
 
-    observation: Tensor
-    """First observation of each slice, ``[B, O]``."""
-    next_observation: Tensor
-    """``[T, B, O]``"""
+    observation: Any
+    """First observation of each slice, ``[B, O]``, or what the encoder takes: a tensor ``[B, ...]`` or a ``TensorDict``
+    with the batch size [B]."""
+    next_observation: Any
+    """``[T, B, O]``, or likewise."""
     action: Tensor
     """``[T, B, A]``"""
     reward: Tensor | None

@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.modules.new_weights import draw_new_weights
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, counted_mean, latent_rollout
 from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
 
@@ -24,8 +25,9 @@ TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tens
 
 PRIORITY = "priority"
 """Under which name among its metrics a term offers errors ``[T, B]`` to make priorities of, where there are weights."""
-_ROLLOUT_FIELDS = ("observation", "next_observation", "action")
-_FIELDS = (*_ROLLOUT_FIELDS, "reward", "terminated", "plan_loc", "plan_scale")
+_FEATURES = ("action", "reward", "terminated", "plan_loc", "plan_scale")
+_OBSERVATIONS = ("observation", "next_observation")
+_FIELDS = (*_OBSERVATIONS, *_FEATURES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +165,8 @@ class LatentRolloutLoss(LossModule):
         """Configurable tensordict keys.
 
         Attributes:
-            observation (NestedKey): flat observation ``[B, T, O]``; its successor is read at ``("next", observation)``.
+            observation (NestedKey): observation, ``[B, T, O]`` or what the encoder takes: any shape and dtype, or a
+                dictionary of entries, with [B, T] in front; its successor is read at ``("next", observation)``.
             action (NestedKey): replayed action ``[B, T, A]`` in [-1, 1].
             reward (NestedKey): read at ``("next", reward)``, ``[B, T, 1]``.
             terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head;
@@ -306,10 +309,10 @@ class LatentRolloutLoss(LossModule):
         """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones."""
         for name in self._attributes:
             if f"{name}_params" in self._modules:
-                self.__dict__[name].reset_parameters_recursive()
+                draw_new_weights(self.__dict__[name])
         for term in self.terms:
             if isinstance(term.function, nn.Module):
-                _reset(term.function)
+                draw_new_weights(term.function)
         parameters: dict[str, Any] = self._modules
         for name, target in parameters.items():
             if name.startswith("target_"):
@@ -329,7 +332,7 @@ class LatentRolloutLoss(LossModule):
 
     def _reads(self) -> dict[NestedKey, NestedKey]:
         """Where each field of the slices is read, and each further key of the terms."""
-        names = dict.fromkeys([*_ROLLOUT_FIELDS, *(key for term in self.active_terms for key in term.keys)])
+        names = dict.fromkeys([*_OBSERVATIONS, "action", *(key for term in self.active_terms for key in term.keys)])
         return {name: self._key(name) for name in names}
 
     def _key(self, name: NestedKey) -> NestedKey:
@@ -368,19 +371,22 @@ class LatentRolloutLoss(LossModule):
             tensordict (TensorDictBase): batch size [B, T].
 
         Raises:
-            ValueError: if an entry is not of shape [B, T, features], or a row of a CPU tensor terminates although the
-                world model has no termination head. Elsewhere that check would wait for the device and is skipped.
+            ValueError: if an entry is not of shape [B, T, features] (one that the encoder owns: [B, T, ...]), or
+                a row of a CPU tensor terminates although the world model has no termination head. Elsewhere that
+                check would wait for the device and is skipped.
             KeyError: if a key is missing.
         """
         reads = self._reads()
-        entries = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
+        entries: dict[NestedKey, Any] = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
+        for name in _OBSERVATIONS:
+            if entries[name].shape[:2] != entries["action"].shape[:2]:
+                raise self._shape_error(reads[name], entries[name])
         counts = self._counted_steps(tensordict, entries["action"].shape[:2])
         self._refuse_termination(tensordict, counts)
         for name, entry in entries.items():
             if counts is not None:
                 # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
-                harmless = torch.ones_like if name == "plan_scale" else torch.zeros_like
-                entry = torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))
+                entry = _where(counts, entry, torch.ones_like if name == "plan_scale" else torch.zeros_like)
             entries[name] = entry.transpose(0, 1)
         fields: dict[str, Any] = {name: entries.pop(name, None) for name in _FIELDS}
         fields["observation"] = fields["observation"][0]
@@ -395,7 +401,7 @@ class LatentRolloutLoss(LossModule):
             weights = weights.reshape(slices, steps)[:, 0].expand(steps, slices).to(fields["action"].dtype)
         return Slices(**fields, counts=counts, weights=weights, extra=entries or None)
 
-    def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor:
+    def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor | TensorDictBase:
         value = tensordict.get(key, None)
         if value is None:
             rename = f"loss.set_keys({name.removeprefix('next_')}=...)" if name in _FIELDS else "Term(keys=...)"
@@ -404,13 +410,16 @@ class LatentRolloutLoss(LossModule):
                 "replay buffer."
             )
         # The batch size is no guide: dispatch infers a longer one where all entries agree in size.
-        if value.ndim != 3 if name in _FIELDS else value.ndim < 2:
-            raise ValueError(
-                f"{type(self).__name__} needs a batch of slices [B, T] and entries of shape [B, T, features], got "
-                f"{key!r} of shape {list(value.shape)}; reshape a flat replay sample with "
-                "sample.reshape(-1, slice_len)."
-            )
+        vector = name in _FEATURES or (name in _OBSERVATIONS and self.world_model.observation_dim is not None)
+        if value.ndim != 3 if vector else value.ndim < 2:
+            raise self._shape_error(key, value)
         return value
+
+    def _shape_error(self, key: NestedKey, value: Tensor | TensorDictBase) -> ValueError:
+        return ValueError(
+            f"{type(self).__name__} needs a batch of slices [B, T] and entries of shape [B, T, features], got "
+            f"{key!r} of shape {list(value.shape)}; reshape a flat replay sample with sample.reshape(-1, slice_len)."
+        )
 
     def write_priority(self, tensordict: TensorDictBase, evaluated: dict[str, Tensor]) -> None:
         """Moves the priorities of a batch, if there are some, from what :meth:`evaluate` returned into the batch."""
@@ -533,6 +542,13 @@ class LatentRolloutLoss(LossModule):
         return error * powers.unsqueeze(-1)
 
 
+def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:
+    """The entry ``[B, T, ...]``, or each of a dictionary, where the step counts, and harmless values elsewhere."""
+    if isinstance(entry, TensorDictBase):
+        return entry.apply(lambda value: _where(counts, value, harmless))
+    return torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))
+
+
 def _check_terms(terms: Sequence[Term], extra_terms: Sequence[Term], taken: Iterable[str]) -> None:
     """Raises where a name of a term, a number or a metric is there twice."""
     names: set[str] = set(taken)
@@ -552,10 +568,3 @@ def _check_terms(terms: Sequence[Term], extra_terms: Sequence[Term], taken: Iter
                 )
         new = own + further
         names.update(new)
-
-
-def _reset(module: nn.Module) -> None:
-    """Draws new weights in every module that can."""
-    for part in module.modules():
-        if hasattr(part, "reset_parameters"):
-            part.reset_parameters()  # pyright: ignore[reportCallIssue]

@@ -16,6 +16,7 @@ from torchrl_etdmpc.planners.scores import (
     ScoreName,
     make_score,
 )
+from torchrl_etdmpc.planners.torchrl_model import TorchRLModel
 
 __all__ = [
     "AdaptiveScore",
@@ -34,6 +35,7 @@ __all__ = [
     "ScoreFunction",
     "ScoreName",
     "ScoringDtype",
+    "TorchRLModel",
     "export_planner",
     "export_policy",
     "make_score",

@@ -143,7 +143,7 @@ class ReanalyzeTransform(Transform):
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Called on every sample ``[B * T]``; re-plans it if it is its turn."""
+        """Called on every sample ``[B * T]`` or ``[B, T]``; re-plans it if it is its turn."""
         if not self.enabled:
             return tensordict
         self.samples += 1
@@ -156,9 +156,9 @@ class ReanalyzeTransform(Transform):
         """Re-plans the first slices of a sample now, whatever the interval.
 
         Args:
-            tensordict (TensorDictBase): a sample of the attached buffer, batch size [B * T], with ``index``. With
-                ``index_generation`` (present in what ``buffer.sample()`` returned) a row that was overwritten since is
-                recognised; without it, a row that is overwritten during the planning.
+            tensordict (TensorDictBase): a sample of the attached buffer, batch size [B * T] or [B, T], with ``index``.
+                With ``index_generation`` (present in what ``buffer.sample()`` returned) a row that was overwritten
+                since is recognised; without it, a row that is overwritten during the planning.
 
         Returns:
             TensorDictBase: the sample with its targets refreshed.
@@ -167,6 +167,8 @@ class ReanalyzeTransform(Transform):
             RuntimeError: if the transform is not attached to a buffer.
             KeyError: if the sample lacks the targets or the index.
         """
+        if tensordict.batch_dims > 1:
+            return self.refresh(tensordict.reshape(-1)).reshape(tensordict.batch_size)
         buffer = self.replay_buffer
         if buffer is None:
             raise RuntimeError("ReanalyzeTransform has no buffer to write to; use reanalyze.attach(replay_buffer).")

@@ -57,6 +57,8 @@ class StepSliceSampler(Sampler):
         partial (bool): whether a slice may also begin in the last T - 1 steps of an episode that has ended (so that
             an ended episode shorter than T is sampled too). Beyond the end such a slice repeats the last step, and a
             sample has ``mask_key``, false there. Shapes stay as they are. Default: ``False``.
+        as_slices (bool): whether a sample has the batch size ``[batch_size / T, T]``, as the losses take it, instead of
+            ``[batch_size]``. Default: ``False``.
 
     Raises:
         ValueError: if an argument is out of range, a batch size is not a multiple of ``slice_len``, or the rows of the
@@ -84,6 +86,7 @@ class StepSliceSampler(Sampler):
         mask_key: NestedKey = MASK,
         uniform_over: UniformOver = "episodes",
         partial: bool = False,
+        as_slices: bool = False,
     ) -> None:
         if slice_len < 1:
             raise ValueError(f"slice_len must be at least 1, got {slice_len}.")
@@ -98,6 +101,7 @@ class StepSliceSampler(Sampler):
         self.mask_key = unravel_key(mask_key)
         self.uniform_over = uniform_over
         self.partial = partial
+        self.as_slices = as_slices
         self._empty()
 
     def _empty(self) -> None:
@@ -118,7 +122,12 @@ class StepSliceSampler(Sampler):
         self._newest = index[-1]
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Draws the rows of ``batch_size / slice_len`` slices, slice after slice, shape ``[batch_size]``."""
+        """Draws the rows of ``batch_size / slice_len`` slices, slice after slice.
+
+        Returns:
+            tuple: the rows, ``[batch_size]``, or ``[batch_size / T, T]`` with ``as_slices``; and what the buffer adds
+                to the sample.
+        """
         if batch_size % self.slice_len:
             raise ValueError(
                 f"batch_size must be a multiple of slice_len={self.slice_len}, got {batch_size}; "
@@ -138,16 +147,17 @@ class StepSliceSampler(Sampler):
             position = (draws[0] * total).astype(np.int64)
             chosen = np.searchsorted(ends, position, side="right")
             offset = position - (ends[chosen] - counts[chosen])
+        shape = (-1, self.slice_len) if self.as_slices else (-1,)
         chosen, steps = chosen[:, None], (first[chosen] + offset)[:, None] + np.arange(self.slice_len)
         info: dict[str, Any] = {}
         if self.partial:
             # The last step again, so that what is masked is as finite and as far from zero as the rest.
             last = self._trajectories.lengths[chosen] - 1
-            valid = torch.from_numpy((steps <= last).reshape(-1)).to(_device(storage))
+            valid = torch.from_numpy((steps <= last).reshape(shape)).to(_device(storage))
             info[self.mask_key] = valid  # pyright: ignore[reportArgumentType]  # nested keys are fine
             steps = np.minimum(steps, last)
         rows = self._trajectories.rows(chosen, steps) % storage.max_size
-        return torch.from_numpy(rows.reshape(-1)).to(_device(storage)), info
+        return torch.from_numpy(rows.reshape(shape)).to(_device(storage)), info
 
     def _sampleable_count(self, storage: Storage, batch_size: int) -> int:
         return int(self._follow(storage)[1].sum())
@@ -287,6 +297,7 @@ class StepSliceSampler(Sampler):
 
     def __repr__(self) -> str:
         partial = ", partial=True" if self.partial else ""
+        partial += ", as_slices=True" if self.as_slices else ""
         return f"{type(self).__name__}(slice_len={self.slice_len}, uniform_over={self.uniform_over!r}{partial})"
 
 

@@ -58,6 +58,8 @@ def _everything(
 ) -> list[Callable[[], object]]:
     """One call of every compiled part, in the shapes of the run."""
     model = agent.world_model
+    observation_dim = model.observation_dim
+    assert observation_dim is not None  # training takes vectors
 
     def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.zeros(shape, dtype=dtype, device=device)
@@ -65,7 +67,7 @@ def _everything(
     def states(*batch: int) -> TensorDict:
         carried = zeros(*batch, agent.planner.horizon, model.action_dim)
         is_init = zeros(*batch, 1, dtype=torch.bool)
-        values = {"observation": zeros(*batch, model.observation_dim), "plan_mean": carried, "is_init": is_init}
+        values = {"observation": zeros(*batch, observation_dim), "plan_mean": carried, "is_init": is_init}
         return TensorDict(values, batch)
 
     def act() -> None:
@@ -85,7 +87,7 @@ def _everything(
     def update() -> None:
         slices = config.optim.batch_size, config.loss.slice_len
         action = zeros(*slices, model.action_dim)
-        following = {"observation": zeros(*slices, model.observation_dim), "reward": zeros(*slices, 1)}
+        following = {"observation": zeros(*slices, observation_dim), "reward": zeros(*slices, 1)}
         following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
         rows = {"observation": following["observation"], "action": action, "next": following}
         rows["plan"] = {"loc": action, "scale": action + 1}

@@ -1,0 +1,148 @@
+"""World models of TorchRL's own under the planner: a point on a line, whose best actions are known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, ModelBasedEnvBase
+from torchrl.envs.model_based import WorldModelEnv
+from torchrl.modules import WorldModel, WorldModelWrapper
+
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, PredictionModel
+from torchrl_etdmpc.planners import TorchRLModel
+
+GOAL = 1.0
+
+
+class Move(nn.Module):
+    """``x' = x + a / 2``; the second number of the state is left as it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, place: Tensor, mark: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        return place + self.gain * action, mark
+
+
+def rewarded(place: Tensor) -> Tensor:
+    return -(place - GOAL).square()
+
+
+def wrapper() -> WorldModelWrapper:
+    states = ["place", ("hidden", "mark")]
+    return WorldModelWrapper(
+        TensorDictModule(Move(), in_keys=[*states, "action"], out_keys=states),
+        TensorDictModule(rewarded, in_keys=["place"], out_keys=["reward"]),
+    )
+
+
+class Imagined(ModelBasedEnvBase):
+    def __init__(self) -> None:
+        super().__init__(wrapper())
+        self.observation_spec = Composite(place=Unbounded((1,)), hidden=Composite(mark=Unbounded((1,))))
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Bounded(-1, 1, (1,))
+        self.reward_spec = Unbounded((1,))
+
+    def _reset(self, tensordict: TensorDictBase, **kwargs) -> TensorDict:
+        return TensorDict({"place": torch.zeros(1), "hidden": {"mark": torch.zeros(1)}})
+
+
+class Real(EnvBase):
+    """Never stepped: it has the specs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_spec = Composite(place=Unbounded((1,)), hidden=Composite(mark=Unbounded((1,))))
+        self.action_spec, self.reward_spec = Bounded(-1, 1, (1,)), Unbounded((1,))
+
+    def _reset(self, tensordict=None):
+        raise NotImplementedError
+
+    _step = _set_seed = _reset
+
+
+def full_model() -> WorldModel:
+    """Writes below "next" and has an encoder: the observation is the place times ten."""
+    states = ["place", ("hidden", "mark")]
+    after = [("next", "place"), ("next", "hidden", "mark")]
+    return WorldModel(
+        TensorDictModule(lambda seen: (seen / 10, torch.zeros_like(seen)), in_keys=["observation"], out_keys=states),
+        TensorDictModule(Move(), in_keys=[*states, "action"], out_keys=after),
+        TensorDictModule(rewarded, in_keys=[after[0]], out_keys=[("next", "reward")]),
+    )
+
+
+def make(model: nn.Module, **options) -> TorchRLModel:
+    return TorchRLModel(model, action_dim=1, state_sizes={"place": 1, ("hidden", "mark"): 1}, **options)
+
+
+MODELS = {
+    "WorldModelWrapper": wrapper,
+    "ModelBasedEnvBase": Imagined,
+    "WorldModel": full_model,
+    "WorldModelEnv": lambda: WorldModelEnv(full_model(), Real()),
+}
+
+
+@pytest.fixture(params=MODELS)
+def adapted(request) -> TorchRLModel:
+    torch.manual_seed(0)
+    return make(MODELS[request.param]())
+
+
+def observations(model: TorchRLModel, place: Tensor) -> Tensor:
+    """As the model takes them: states, or what its encoder reads."""
+    return torch.stack([place, torch.zeros_like(place)], -1) if model.encoder is None else 10 * place.unsqueeze(-1)
+
+
+def test_the_ensemble_planner_finds_the_known_optimum(adapted):
+    assert isinstance(adapted, PredictionModel)
+    budget = {"horizon": 2, "num_samples": 64, "num_elites": 8, "num_proposals": 0, "iterations": 4}
+    planner = EnsembleMPPIPlanner(LatentEnv(adapted), warm_start=False, **budget)
+    place = torch.tensor([-1.0, 0.8, 1.0, 1.25, 3.0])
+    plan = planner.plan(observations(adapted, place), explore=False)
+    best = ((GOAL - place) / 0.5).clamp(-1, 1)
+    torch.testing.assert_close(plan.action.squeeze(-1), best, atol=0.15, rtol=0)
+    batch = TensorDict({"observation": observations(adapted, place)}, [5])
+    assert planner(batch)["plan", "fallback"].any().logical_not()
+    assert any(weight is parameter for weight in planner.parameters() for parameter in adapted.model.parameters())
+
+
+def test_predictions_are_those_of_the_model_in_any_leading_batch(adapted):
+    latent, action = torch.randn(1, 4, 1, 2), torch.rand(4, 3, 1) * 2 - 1
+    following = adapted.next(latent, action)
+    assert following.shape == (1, 4, 3, 2)
+    torch.testing.assert_close(following[0, ..., :1], latent[0, ..., :1] + 0.5 * action)
+    torch.testing.assert_close(following[0, ..., 1], latent[0, ..., 1].expand(4, 3))
+    torch.testing.assert_close(
+        adapted.reward(latent.expand(1, 4, 3, 2)[0], action), -(following[0, ..., 0] - GOAL).square()
+    )
+    assert adapted.values(latent).shape == (1, 4, 1, 1) and adapted.termination(latent) is None
+
+
+def test_an_imagined_rollout_follows_the_plan(adapted):
+    env = LatentEnv(adapted)
+    planner = EnsembleMPPIPlanner(env, horizon=2, num_samples=64, num_elites=8, num_proposals=0, warm_start=False)
+    with torch.no_grad():
+        rollout = env.rollout(4, planner)
+    assert rollout["next", "latent"][-1, 0] == pytest.approx(GOAL, abs=0.1)
+
+
+def test_values_and_ends_are_those_that_are_given():
+    value = TensorDictModule(lambda place: 3 * place, in_keys=["place"], out_keys=["state_value"])
+    latent = torch.tensor([[2.0, 0.0], [1.0, 5.0]])
+    assert make(wrapper(), values=value).values(latent).tolist() == [[6.0], [3.0]]
+    model = make(wrapper(), values=lambda z: z, termination=lambda z: (z[..., 1] > 1).float())
+    assert model.values(latent).shape == (2, 2)
+    assert model.termination(latent).tolist() == [0.0, 1.0]
+
+
+def test_what_is_no_model_of_torchrl_is_refused():
+    with pytest.raises(TypeError, match=r"^model must be a ModelBasedEnvBase or a TensorDict module, got Linear; wrap"):
+        make(nn.Linear(2, 2))
