@@ -105,6 +105,7 @@ UTD4 = {
     "loss.kl_direction": "backward",
     "loss.tau": 0.01,
     "loss.discount": None,  # from the episode's length
+    "loss.extra_terms": None,
     "optim.batch_size": 256,
     "optim.updates_per_decision": 4,
     "optim.lr": 3e-4,
@@ -570,7 +571,7 @@ OWN_DEFAULT = {
         *("horizon", "num_samples", "num_elites", "num_proposals", "score"),
         *("proposal_log_std_min", "proposal_log_std_max"),
     },
-    LossConfig: {"discount", "slice_len"},  # the classes have none
+    LossConfig: {"discount", "slice_len", "extra_terms"},  # the classes have none; a path to the terms
 }
 
 

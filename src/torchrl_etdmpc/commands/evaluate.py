@@ -41,6 +41,12 @@ class EvaluateConfig:
     """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
     terminates: bool | None = None
     """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
+    score: str | None = None
+    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
+    reanalyze_score: str | None = None
+    """Likewise a ``reanalyze.score``."""
+    extra_terms: str | None = None
+    """Likewise ``loss.extra_terms``."""
     seed: int = 0
     """Of the initial states and the planner's samples."""
     device: str = "auto"

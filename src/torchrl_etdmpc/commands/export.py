@@ -31,6 +31,12 @@ class ExportConfig:
     """``task.episode_length``; likewise."""
     terminates: bool | None = None
     """``task.terminates``; likewise."""
+    score: str | None = None
+    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
+    reanalyze_score: str | None = None
+    """Likewise a ``reanalyze.score``."""
+    extra_terms: str | None = None
+    """Likewise ``loss.extra_terms``."""
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:

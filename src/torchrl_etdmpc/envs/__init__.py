@@ -7,7 +7,7 @@ from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.make import make_env
 from torchrl_etdmpc.envs.render import render_frame
 from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, list_tasks, register_task
-from torchrl_etdmpc.envs.user_task import import_task
+from torchrl_etdmpc.envs.user_task import import_attribute, import_task
 
 __all__ = [
     "DMC_TASKS",
@@ -17,6 +17,7 @@ __all__ = [
     "check_env",
     "check_spaces",
     "get_task",
+    "import_attribute",
     "import_task",
     "list_tasks",
     "load_simulator_state",

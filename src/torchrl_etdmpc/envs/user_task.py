@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter, Transform, Tr
 from torchrl_etdmpc.envs.make import find_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
 
-__all__ = ["import_task"]
+__all__ = ["import_attribute", "import_task"]
 
 
 def import_task(
@@ -28,8 +28,7 @@ def import_task(
 ) -> Task:
     """Imports a user's own task and registers it under its path.
 
-    This is the only place that follows a path to code. The path must come from the person who started the program,
-    never from a file.
+    The path must come from the person who started the program, never from a file.
 
     Args:
         path (str): ``package.module:attribute``; the module is looked for on Python's path and in the current
@@ -57,7 +56,7 @@ def import_task(
     """
     told: dict[str, Any] = {"action_repeat": action_repeat, "episode_length": episode_length, "terminates": terminates}
     told = {field: value for field, value in told.items() if value is not None}
-    found = _follow(path)
+    found = import_attribute(path, "task")
     if isinstance(found, Task):
         maker: Maker = partial(_make_as, found.name, find_maker(found))
         task = dataclasses.replace(found, name=path, **told)
@@ -74,10 +73,25 @@ def import_task(
     return task
 
 
-def _follow(path: str) -> Any:
+def import_attribute(path: str, setting: str) -> Any:
+    """Follows a path to code, the only place that does.
+
+    The path must come from the person who started the program, never from a file.
+
+    Args:
+        path (str): ``package.module:attribute``, of a function or (for tasks) a :class:`~torchrl_etdmpc.envs.Task`; the
+            module is looked for on Python's path and in the current directory.
+        setting (str): what names the path, for messages.
+
+    Raises:
+        ValueError: if nothing can be found there, or something else.
+
+    >>> import_attribute("math:floor", "planner.score")(2.5)
+    2
+    """
     module_name, _, attribute = path.partition(":")
     if not module_name or not attribute:
-        raise ValueError(f"task {path!r} must read package.module:attribute.")
+        raise ValueError(f"{setting} {path!r} must read package.module:attribute.")
     here = os.getcwd()
     if here not in sys.path:
         sys.path.append(here)  # for good: the user's code may import more, later and in worker processes
@@ -87,13 +101,16 @@ def _follow(path: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # the user's module was found, and misses another one
-        raise ValueError(f"task {path!r}: there is no module {module_name!r} on Python's path or in {here}.") from error
+        raise ValueError(
+            f"{setting} {path!r}: there is no module {module_name!r} on Python's path or in {here}."
+        ) from error
     found = getattr(module, attribute, None)
     if found is None:
         where = getattr(module, "__file__", None) or "built in"
-        raise ValueError(f"task {path!r}: the module {module_name!r} ({where}) has no {attribute!r}.")
+        raise ValueError(f"{setting} {path!r}: the module {module_name!r} ({where}) has no {attribute!r}.")
     if not (callable(found) or isinstance(found, Task)):
-        raise ValueError(f"task {path!r} must be a function or a Task, got {type(found).__name__}.")
+        kind = "a function or a Task" if setting == "task" else "a function"
+        raise ValueError(f"{setting} {path!r} must be {kind}, got {type(found).__name__}.")
     return found
 
 

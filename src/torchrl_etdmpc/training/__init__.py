@@ -25,6 +25,7 @@ from torchrl_etdmpc.training.launch import (
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.signals import EXIT_CODE, RunInterrupted
+from torchrl_etdmpc.training.stepper import UpdateStepper
 from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
 
@@ -42,6 +43,7 @@ __all__ = [
     "RunInterrupted",
     "TrainConfig",
     "TrainingRun",
+    "UpdateStepper",
     "Updater",
     "as_typed",
     "build_agent",

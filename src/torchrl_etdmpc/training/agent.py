@@ -14,6 +14,7 @@ from torchrl_etdmpc.objectives import EfficientTDMPCLoss
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
 from torchrl_etdmpc.training.compilation import compile_call, resolve_compile
 from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig, arguments, named_settings
+from torchrl_etdmpc.training.own_code import own_code
 from torchrl_etdmpc.training.updater import Updater
 
 
@@ -93,10 +94,11 @@ def build_planner(
         group (str): the group's name, for messages. Default: ``"planner"``.
     """
     schedule = ("every", "num_slices") if group == "reanalyze" else ()  # of ReanalyzeTransform
+    values = arguments(config, *schedule)
+    if ":" in config.score:
+        values["score"] = own_code(f"{group}.score", config.score)
     with named_settings(group, config):
-        planner = EnsembleMPPIPlanner(
-            LatentEnv(world_model), discount=discount, warm_start=warm_start, **arguments(config, *schedule)
-        )
+        planner = EnsembleMPPIPlanner(LatentEnv(world_model), discount=discount, warm_start=warm_start, **values)
     if compile_mode is not None:
         planner.compiled_plan = compile_call(planner.plan, compile_mode)
     return planner
@@ -122,13 +124,16 @@ def build_agent(
     if discount is None:
         discount = discount_from_episode_length(task.decision_steps_per_episode)
     world_model = build_world_model(config.model, observation_dim, action_dim, terminates=task.terminates).to(device)
+    terms = config.loss.extra_terms
+    extra_terms = [] if terms is None else own_code("loss.extra_terms", terms)(world_model)
     with named_settings("loss", config.loss, scale_tau="tau"):
         loss = EfficientTDMPCLoss(
             world_model,
             discount=discount,
             scale_tau=config.loss.tau,
             ignore_termination=config.model.termination is False,
-            **arguments(config.loss, "slice_len", "tau", "discount"),
+            extra_terms=extra_terms,
+            **arguments(config.loss, "slice_len", "tau", "discount", "extra_terms"),
         )
     with named_settings("optim", config.optim):
         optim = arguments(config.optim, "batch_size", "updates_per_decision")

@@ -15,6 +15,7 @@ from typing import Any
 from torchrl_etdmpc.envs import import_task, list_tasks
 from torchrl_etdmpc.runs import console, first_line
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig, config_from_dict
+from torchrl_etdmpc.training.own_code import follow_own_code
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.settings_help import Setting, groups_of, help_text, settings_of
 
@@ -99,7 +100,7 @@ def hydra_main(
             except ImportError as error:
                 raise ImportError("this command needs hydra-core; run: pip install 'hydra-core>=1.3,<1.4'") from error
             sys.argv[1:] = _checked(sys.argv[1:], config_class)
-            _import_tasks(sys.argv[1:])
+            _import_own_code(sys.argv[1:])
             os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach us instead of being printed over many lines
             for name, values in PRESETS.items():
                 ConfigStore.instance().store(group="preset", name=name, node=values.to_dict(), package="_global_")
@@ -257,14 +258,17 @@ def explicit_settings(arguments: list[str] | None = None) -> list[str]:
     return [name for name in names if not name.startswith(("hydra", "-", "~"))]
 
 
-def _import_tasks(arguments: list[str]) -> None:
-    """Follows a task that is a path to code, ``task=package.module:function``.
+def _import_own_code(arguments: list[str]) -> None:
+    """Follows a task, a score or terms that are a path to code, ``task=package.module:function``.
 
-    Only the command line can make this process import code: a stored configuration that names such a task is refused
+    Only the command line can make this process import code: a stored configuration that names such a path is refused
     unless the command repeats it.
     """
     given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
     given = {name: value.strip("'") for name, value in given.items()}
+    for name, value in given.items():
+        for path in value.split(","):  # a sweep names several
+            follow_own_code(name, path)
     settings = {}
     for name in TASK_SETTINGS:
         try:

@@ -23,6 +23,7 @@ from torchrl_etdmpc.planners.ensemble_mppi import FirstAction, ScoringDtype
 from torchrl_etdmpc.planners.scores import ScoreName
 from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
+from torchrl_etdmpc.training.own_code import OWN_CODE, own_code
 
 TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
 """Written as ``task.action_repeat`` etc. on the command line; ``task`` itself is a name, not a group."""
@@ -65,7 +66,8 @@ class PlannerConfig:
     extra_iterations: int = 2
     large_action_dim: int = 20
     """More dimensions than this count as many."""
-    score: ScoreName = "mean"
+    score: ScoreName | str = "mean"
+    """What a candidate is worth by its table of returns; or a function of your own, ``module:function``."""
     beta: float = 0.0
     inverse_temperature: float = 0.5
     std_min: float = 0.05
@@ -86,7 +88,7 @@ class ReanalyzeConfig(PlannerConfig):
     num_samples: int = 64
     num_elites: int = 8
     num_proposals: int = 3
-    score: ScoreName = "final"
+    score: ScoreName | str = "final"
     every: int = 10
     """Decision steps between two reanalyzed batches; 0 turns reanalyze off."""
     num_slices: int = 20
@@ -116,6 +118,8 @@ class LossConfig:
     """Rate of the target values and of the running scale."""
     discount: float | None = None
     """Default: from the episode length (0.99 for DMC)."""
+    extra_terms: str | None = None
+    """Terms of your own, ``module:function``: a function of the world model that returns a list of Term."""
 
 
 @dataclass(frozen=True)
@@ -382,6 +386,9 @@ def _check_types(config: Any, prefix: str = "") -> None:
 
 
 def _convert(hint: Any, value: Any, name: str) -> Any:
+    if name in OWN_CODE and isinstance(value, str) and (":" in value or not _choices(hint)):
+        own_code(OWN_CODE[name], value)
+        return value
     if typing.get_origin(hint) in (types.UnionType, typing.Union):  # the latter with a Literal in it
         if value is None:
             return None
@@ -402,6 +409,10 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
     if type(value) is not hint:
         raise ValueError(f"{name} must be of type {hint.__name__}, got {value!r}.")
     return value
+
+
+def _choices(hint: Any) -> bool:
+    return any(typing.get_origin(option) is Literal for option in typing.get_args(hint))
 
 
 # What single precision holds with room for sums and squares of it, and what a float counts without a gap.

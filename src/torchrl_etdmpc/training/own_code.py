@@ -1,0 +1,50 @@
+"""Code of the user's own behind a setting: a score, terms of the loss."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torchrl_etdmpc.envs import import_attribute
+
+OWN_CODE = {
+    "planner.score": "planner.score",
+    "reanalyze.score": "reanalyze.score",
+    "loss.extra_terms": "loss.extra_terms",
+    # Of the commands that read an agent file.
+    "score": "planner.score",
+    "reanalyze_score": "reanalyze.score",
+    "extra_terms": "loss.extra_terms",
+}
+"""Settings that may be a path to code, as a command line spells them, and the run's setting that each stands for."""
+
+_followed: dict[tuple[str, str], Callable[..., Any]] = {}
+
+
+def follow_own_code(name: str, value: str) -> None:
+    """Imports the code that a command line names, if this setting does; nothing else may call this.
+
+    Args:
+        name (str): the setting, as it was typed.
+        value (str): its value.
+
+    Raises:
+        ValueError: if there is nothing at the path.
+    """
+    if name in OWN_CODE and (":" in value or (name.endswith("extra_terms") and value != "null")):
+        _followed[OWN_CODE[name], value] = import_attribute(value, name)
+
+
+def own_code(setting: str, path: str) -> Callable[..., Any]:
+    """What the command line imported for a setting of the run.
+
+    Raises:
+        ValueError: if it did not: a stored configuration may hold a path, and no file may make us import code.
+    """
+    if (setting, path) not in _followed:
+        short = next(name for name, meant in reversed(OWN_CODE.items()) if meant == setting)
+        raise ValueError(
+            f"{setting} {path!r} names code, which must be given on the command line: {setting}={path} to train, "
+            f"{short}={path} with an agent file."
+        )
+    return _followed[setting, path]

@@ -1,0 +1,112 @@
+"""A score and terms of one's own, by a path on the command line: how many lines, and never from a file alone."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from torchrl_etdmpc.commands import evaluate, export, train
+from torchrl_etdmpc.training import TrainConfig, load_agent
+
+pytest.importorskip("hydra")
+pytest.importorskip("gymnasium")
+
+# Each is the whole of what a user writes.
+SCORE = """
+def cautious(returns):
+    return returns.amin((-2, -1)).mean(-1)
+"""
+TERMS = """
+from torchrl_etdmpc.objectives import Term
+
+def small_actions(world_model, slices, rollout):
+    mean, _ = world_model.policy(rollout.predicted[:-1].detach())
+    return mean.square().mean((1, -1))
+
+def terms(world_model):
+    return [Term("small_actions", small_actions, coef=0.1)]
+"""
+TINY = [
+    *("task=gym/Pendulum-v1", "preset=cpu", "compile=off", "total_env_steps=230", "task.episode_length=20"),
+    *("eval_every=1000", "checkpoint_every=1000", "log_every=50", "eval_episodes=1", "replay.seed_decisions=200"),
+    *("replay.pretrain_updates=2", "model.latent_dim=8", "model.mlp_dim=8", "model.encoder_dim=8", "run_dir=run"),
+    *("planner.horizon=2", "planner.num_samples=6", "planner.num_elites=3", "planner.iterations=1"),
+]
+OWN = ["planner.score=my_ideas:cautious", "loss.extra_terms=my_ideas:terms"]
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch) -> Callable[..., None]:
+    (tmp_path / "my_ideas.py").write_text(SCORE + TERMS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+    def run(command, *arguments: str) -> None:
+        # As in a process of its own.
+        monkeypatch.setattr("torchrl_etdmpc.training.own_code._followed", {})
+        sys.modules.pop("my_ideas", None)
+        monkeypatch.setattr(sys, "argv", ["command", *arguments])
+        command.main()
+
+    return run
+
+
+def test_a_score_and_terms_are_reached_from_the_command_line_and_from_there_alone(call, capsys):
+    call(train, *TINY, *OWN)
+    assert "small_actions_error" in Path("run/train.csv").read_text()
+    agent = "checkpoint=run/checkpoints/last.pt"
+    repeated = ["score=my_ideas:cautious", "extra_terms=my_ideas:terms"]
+    call(evaluate, agent, "episodes=1", *repeated)
+    assert "return -" in capsys.readouterr().out
+    loaded, config, _ = load_agent(agent.partition("=")[2])
+    assert config.planner.score == "my_ideas:cautious"
+    assert loaded.planner.score.function.__name__ == "cautious"
+    assert [term.name for term in loaded.loss.terms][-1] == "small_actions"
+
+    # The files alone lead to no import.
+    for command, arguments in (
+        (evaluate, [agent]),
+        (export, [agent]),
+        (evaluate, [agent, repeated[1]]),
+        (train, ["run_dir=run", "resume=on", "total_env_steps=260"]),
+    ):
+        with pytest.raises(
+            SystemExit, match=r"planner\.score 'my_ideas:cautious' names code, which must be given on the"
+        ):
+            call(command, *arguments)
+        assert command is not train or "my_ideas" not in sys.modules
+    with pytest.raises(SystemExit, match=r"loss\.extra_terms 'my_ideas:terms' names code, which must be given on the"):
+        call(evaluate, agent, repeated[0])
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("planner.score=nowhere:score", "planner.score 'nowhere:score': there is no module 'nowhere' on Python's path"),
+        ("planner.score=my_ideas:brave", "planner.score 'my_ideas:brave': the module 'my_ideas' "),
+        ("planner.score=median", "planner.score must be one of final, mean, adaptive, got 'median'."),
+        ("loss.extra_terms=my_ideas", "loss.extra_terms 'my_ideas' must read package.module:attribute."),
+        ("planner.score=my_ideas:__name__", "planner.score 'my_ideas:__name__' must be a function, got str."),
+    ],
+)
+def test_a_path_that_leads_nowhere_is_refused_in_one_line(call, typed, message):
+    with pytest.raises(SystemExit) as caught:
+        call(train, *TINY, typed)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_configuration_with_a_path_that_nobody_followed_is_refused():
+    for values in ({"planner": {"score": "os:getcwd"}}, {"loss": {"extra_terms": "os:getcwd"}}):
+        with pytest.raises(ValueError, match=r"'os:getcwd' names code, which must be given on the command line"):
+            TrainConfig.from_dict({"preset": "cpu", **values})
+
+
+def test_they_cost_few_lines():
+    def count(code: str) -> int:
+        return len([line for line in code.splitlines() if line.strip()])
+
+    assert count(SCORE) == 2
+    assert count(TERMS) <= 10
