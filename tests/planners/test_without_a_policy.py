@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -43,6 +45,12 @@ class Line(nn.Module):
 def make_planner(world: Line, **options) -> EnsembleMPPIPlanner:
     torch.manual_seed(0)
     return EnsembleMPPIPlanner(LatentEnv(world), **(START | options))
+
+
+def test_a_model_of_one_s_own_is_short():
+    lines = [line for line in inspect.getsource(Line).splitlines() if line.strip()]
+    assert len(lines) + 1 <= 25  # and the line that plans over it
+    assert "._" not in "".join(lines).replace(".__init__", "")
 
 
 def test_a_policy_is_no_part_of_what_planning_needs():
