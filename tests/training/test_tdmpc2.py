@@ -64,6 +64,7 @@ def test_a_run_that_was_killed_goes_on_as_if_nothing_had_happened(tmp_path, smal
     config = small_config()
     straight = make_run(config, tmp_path / "straight")
     straight.run()
+    expected = outcome(straight, tmp_path / "straight")
     run = make_run(config, tmp_path / "killed")
     for owner, method, call in (("updater", "step", 4), ("updater", "step", 9), ("collector", "act", 12)):
         part = run.learner.agent.updater if owner == "updater" else run.learner.collector
@@ -80,7 +81,7 @@ def test_a_run_that_was_killed_goes_on_as_if_nothing_had_happened(tmp_path, smal
         run.log.directory.close()
         run = make_run(config, tmp_path / "killed", resume=True)
     run.run()
-    assert outcome(run, tmp_path / "killed") == outcome(straight, tmp_path / "straight")
+    assert outcome(run, tmp_path / "killed") == expected
     assert run.learner.agent.updater.updates == 7 + 2 * 50
 
 
@@ -143,11 +144,15 @@ def test_compiled_plans_and_updates_equal_eager_ones(small_config):
     assert all(torch.equal(value, weights[name]) for name, value in compiled.loss.state_dict().items())
     torch.set_rng_state(state)
     metrics, plans = [], []
-    observation = torch.randn(2, 5)
     for agent in (eager, compiled):
         torch.manual_seed(1)
         metrics.append(agent.updater.step(batch).to_dict())
-        plan = agent.planner.plan if agent is eager else agent.planner.compiled_plan
+    with torch.no_grad():  # scores that differ by more than rounding, the same for both
+        for head in (eager.world_model.reward_head, eager.world_model.value_head):
+            head.output.weight.normal_(0.0, 0.5)
+        compiled.world_model.load_state_dict(eager.world_model.state_dict())
+    observation = torch.randn(2, 5)
+    for plan in (eager.planner.plan, compiled.planner.compiled_plan):
         torch.manual_seed(2)
         plans.append(plan(observation))
     torch.testing.assert_close(metrics[1], metrics[0], rtol=1e-4, atol=1e-5)
