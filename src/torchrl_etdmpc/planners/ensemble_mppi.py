@@ -466,7 +466,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 actions = torch.cat([proposals, actions], dim=1)
                 scores, returns = self._evaluate(latent, actions, weights_cast, noise, iteration)
                 proposed = proposals, scores[:, : self.num_proposals], returns[:, : self.num_proposals]
-            else:  # the proposals keep the scores of the first iteration
+            else:
+                # Departure from TD-MPC2, which scores the proposals anew in every iteration: they keep the scores of
+                # the first one, which differ from the later ones by other draws alone.
                 drawn = actions, *self._evaluate(latent, actions, weights_cast, noise, iteration)
                 actions, scores, returns = (torch.cat(pair, dim=1) for pair in zip(proposed, drawn, strict=True))
             elites = select_elites(actions, scores, self.num_elites)
