@@ -49,6 +49,7 @@ def report() -> str:
         lines.append(f"| {row['seed']} | {minutes} | {row['decisions_per_second']:.0f} | {row['parameters']} |")
     versions = {json.dumps(row["versions"], sort_keys=True) for row in summaries}
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
+    lines += ["Its machine was shared with other work, so that the times are those of a fraction of a core."]
     return "\n".join([*lines, "", "![learning curves](curves.png)", ""])
 
 
