@@ -45,6 +45,7 @@ def run(
     seed: int,
     env_steps: int,
     *overrides: str,
+    preset: str = "cpu",
     target: Path | None = None,
     keep: Sequence[str] = ("eval", "summary"),
 ) -> str:
@@ -54,7 +55,7 @@ def run(
         return f"{task} seed {seed}: already there"
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        command = [sys.executable, str(ROOT / "examples" / "train_dmc.py"), "preset=cpu", f"task={task}"]
+        command = [sys.executable, str(ROOT / "examples" / "train_dmc.py"), f"preset={preset}", f"task={task}"]
         command += [f"seed={seed}", f"total_env_steps={env_steps}", f"run_dir={run_dir}", *overrides]
         result = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
         if result.returncode:

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchrl_etdmpc.collectors import NonFiniteError, SeedPolicy, SimulatorError, StepCollector
-    from torchrl_etdmpc.modules import PredictionModel, WorldModel
+    from torchrl_etdmpc.modules import ActionValueWorldModel, PredictionModel, WorldModel
     from torchrl_etdmpc.objectives import (
         EfficientTDMPCLoss,
         EfficientTDMPCModelLoss,
         EfficientTDMPCPolicyLoss,
         EfficientTDMPCValueLoss,
+        TDMPC2Loss,
     )
     from torchrl_etdmpc.planners import (
         AdaptiveScore,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0.dev0"
 
 __all__ = [
+    "ActionValueWorldModel",
     "AdaptiveScore",
     "EfficientTDMPCLoss",
     "EfficientTDMPCModelLoss",
@@ -54,6 +56,7 @@ __all__ = [
     "SimulatorError",
     "StepCollector",
     "StepSliceSampler",
+    "TDMPC2Loss",
     "WorldModel",
     "export_planner",
     "export_policy",

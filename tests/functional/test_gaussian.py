@@ -6,7 +6,13 @@ import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
 
-from torchrl_etdmpc.functional import bounded_log_std, clipped_sample, gaussian_entropy, gaussian_kl
+from torchrl_etdmpc.functional import (
+    bounded_log_std,
+    clipped_sample,
+    gaussian_entropy,
+    gaussian_kl,
+    tanh_log_slope,
+)
 
 MEAN_P = torch.tensor([0.0, 0.5, -0.9, 0.3], dtype=torch.float64)
 STD_P = torch.tensor([0.05, 1.0, 0.4, 2.0], dtype=torch.float64)
@@ -89,3 +95,13 @@ def test_log_std_is_the_formula_of_the_thesis():
     # lo + (hi - lo) / 2 * (tanh(raw) + 1)
     value = bounded_log_std(torch.tensor(0.7, dtype=torch.float64), -3.0, 1.0).item()
     assert value == pytest.approx(-3 + 2 * (math.tanh(0.7) + 1), abs=1e-12)
+
+
+def test_the_log_slope_of_the_tanh_is_its_derivative_and_finite_where_it_is_saturated():
+    x = torch.linspace(-5, 5, 11, dtype=torch.float64)
+    torch.testing.assert_close(tanh_log_slope(x), (1 - x.tanh().square()).log())
+    far = torch.tensor([-1e3, 1e3], requires_grad=True)
+    slopes = tanh_log_slope(far)
+    slopes.sum().backward()
+    assert slopes.isfinite().all()
+    torch.testing.assert_close(far.grad, torch.tensor([2.0, -2.0]))

@@ -43,6 +43,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
                 "dropout": mostly(st.sampled_from([0.0, 0.1]), 1.0),
                 "activation": st.sampled_from(["mish", "silu", "relu"]),
                 "termination": st.sampled_from([None, False, True]),
+                "action_values": st.booleans(),
             }
         ),
         "planner": st.fixed_dictionaries(
@@ -75,6 +76,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
             {
                 "seed_decisions": st.integers(4, 20),
                 "pretrain_updates": st.integers(0, 2),
+                "pretrain_policy": st.booleans(),
                 "capacity": st.integers(8, 60),
                 "uniform_over": st.sampled_from(["episodes", "starts"]),
                 "partial": st.booleans(),

@@ -15,6 +15,7 @@ from torchrl_etdmpc import (
     ReanalyzeTransform,
     StepCollector,
     StepSliceSampler,
+    TDMPC2Loss,
     WorldModel,
 )
 from torchrl_etdmpc.training import (
@@ -60,6 +61,7 @@ UTD4 = {
     "model.log_std_min": -3.0,
     "model.log_std_max": 1.0,
     "model.activation": "mish",
+    "model.action_values": False,
     "model.termination": None,  # DMC never terminates
     "planner.horizon": 6,
     "planner.score": "mean",
@@ -103,6 +105,7 @@ UTD4 = {
     "loss.termination_coef": 1.0,
     "loss.entropy_coef": 1e-4,
     "loss.kl_direction": "backward",
+    "loss.squashed_entropy": True,  # of action values alone
     "loss.tau": 0.01,
     "loss.discount": None,  # from the episode's length
     "loss.extra_terms": None,
@@ -118,6 +121,7 @@ UTD4 = {
     "replay.device": "auto",
     "replay.seed_decisions": None,  # max(1000, 5 episodes)
     "replay.pretrain_updates": None,  # as many as seed decisions
+    "replay.pretrain_policy": False,
 }
 
 # What the other rows of the table of presets change in it.
@@ -136,6 +140,20 @@ CHANGES = {
         "optim.updates_per_decision": 1,
         "reanalyze.every": 10,
         "replay.insertion": "episode",
+    },
+    "tdmpc2": {
+        "model.action_values": True,
+        "model.num_dynamics": 1,
+        "model.num_values": 5,
+        "model.log_std_min": -10.0,
+        "model.log_std_max": 2.0,
+        "planner.horizon": 3,
+        "planner.score": "final",
+        "planner.eval_first_action": "elite",
+        "reanalyze.every": 0,
+        "optim.updates_per_decision": 1,
+        "replay.insertion": "episode",
+        "replay.pretrain_policy": True,
     },
 }
 
@@ -168,7 +186,7 @@ def test_a_preset_is_the_paper_s_table_value_by_value(name):
 
 
 def test_every_preset_is_known_by_its_own_name():
-    assert set(PRESETS) == {*CHANGES, "cpu"}
+    assert set(PRESETS) == {*CHANGES, "cpu", "tdmpc2-cpu"}
     assert all(preset(name).preset == name for name in PRESETS)
 
 
@@ -205,6 +223,14 @@ def test_the_cpu_preset_shrinks_sizes_and_keeps_the_whole_method():
     assert settings["planner.horizon"] >= 2  # at 1 the mean over depths is no mean
     assert settings["reanalyze.every"] >= 1
     assert settings["replay.insertion"] == "step"
+
+
+def test_the_small_tdmpc2_is_tdmpc2_with_the_sizes_of_cpu():
+    small, full, cpu = (method_settings(preset(name)) for name in ("tdmpc2-cpu", "tdmpc2", "cpu"))
+    changed = {name for name, value in small.items() if value != full[name]}
+    assert all(small[name] == cpu[name] for name in changed)
+    assert {name.partition(".")[0] for name in changed} == {"model", "planner", "loss", "optim", "replay"}
+    assert preset("tdmpc2-cpu").total_env_steps == preset("cpu").total_env_steps
 
 
 def test_an_unknown_preset_is_refused_with_the_known_names():
@@ -554,15 +580,16 @@ ARGUMENTS_OF = {
     ModelConfig: (WorldModel,),
     PlannerConfig: (EnsembleMPPIPlanner,),
     ReanalyzeConfig: (EnsembleMPPIPlanner, ReanalyzeTransform),
-    LossConfig: (EfficientTDMPCLoss, StepSliceSampler, Updater),
+    LossConfig: (EfficientTDMPCLoss, TDMPC2Loss, StepSliceSampler, Updater),
     OptimConfig: (Updater,),
     ReplayConfig: (StepSliceSampler, StepCollector),
 }
 # Settings of the loop, which no class takes as they are.
 OF_THE_LOOP = {
+    ModelConfig: {"action_values"},  # which of the two world models
     ReanalyzeConfig: {"every"},
     OptimConfig: {"batch_size", "updates_per_decision"},
-    ReplayConfig: {"capacity", "device", "seed_decisions", "pretrain_updates"},
+    ReplayConfig: {"capacity", "device", "seed_decisions", "pretrain_updates", "pretrain_policy"},
 }
 # Arguments whose default is not the class'.
 OWN_DEFAULT = {

@@ -31,7 +31,9 @@ def test_the_full_size_on_a_cpu_is_said_to_take_long_and_the_small_preset_is_nam
     assert line.endswith(
         "preset=efficient-tdmpc is made for a GPU and there is none here: preset=cpu learns in minutes"
     )
-    assert "GPU" not in what_it_takes(PRESETS["cpu"], torch.device("cpu"))
+    assert what_it_takes(PRESETS["tdmpc2"], torch.device("cpu")).endswith("preset=tdmpc2-cpu learns in minutes")
+    for small in ("cpu", "tdmpc2-cpu"):
+        assert "GPU" not in what_it_takes(PRESETS[small], torch.device("cpu"))
 
 
 def test_an_estimate_draws_no_random_numbers():

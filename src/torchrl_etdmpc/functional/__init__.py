@@ -1,7 +1,13 @@
 """Pure maths on tensors: no state, no modules, any leading batch."""
 
 from torchrl_etdmpc.functional.activation import mish
-from torchrl_etdmpc.functional.gaussian import bounded_log_std, clipped_sample, gaussian_entropy, gaussian_kl
+from torchrl_etdmpc.functional.gaussian import (
+    bounded_log_std,
+    clipped_sample,
+    gaussian_entropy,
+    gaussian_kl,
+    tanh_log_slope,
+)
 from torchrl_etdmpc.functional.horizon import adaptive_mixture, ensemble_mean, ensemble_variance
 from torchrl_etdmpc.functional.mppi import (
     Elites,
@@ -40,6 +46,7 @@ __all__ = [
     "simnorm",
     "symexp",
     "symlog",
+    "tanh_log_slope",
     "two_hot_cross_entropy",
     "two_hot_decode",
     "two_hot_encode",

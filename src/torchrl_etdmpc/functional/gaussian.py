@@ -10,6 +10,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 
 def bounded_log_std(raw: Tensor, low: float, high: float) -> Tensor:
@@ -65,6 +66,23 @@ def gaussian_kl(mean_p: Tensor, std_p: Tensor, mean_q: Tensor, std_q: Tensor) ->
     """
     variance_q = std_q.square()
     return std_q.log() - std_p.log() + (std_p.square() + (mean_p - mean_q).square()) / (2 * variance_q) - 0.5
+
+
+def tanh_log_slope(x: Tensor) -> Tensor:
+    """``ln(1 - tanh(x)^2)``, elementwise, exact where the tanh is saturated: what a tanh does to a log density.
+
+    ``2 (ln 2 - x - softplus(-2 x))``. The entropy of ``tanh(x)`` is that of x plus the mean of this.
+
+    Args:
+        x (Tensor): before the tanh, any shape.
+
+    Returns:
+        Tensor: at most 0, same shape.
+
+    >>> tanh_log_slope(torch.tensor([0.0, 100.0])).tolist()
+    [0.0, -198.61370849609375]
+    """
+    return 2 * (math.log(2) - x - softplus(-2 * x))
 
 
 def gaussian_entropy(log_std: Tensor) -> Tensor:

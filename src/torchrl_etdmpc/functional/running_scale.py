@@ -1,4 +1,4 @@
-"""The running scale that normalises the distillation loss."""
+"""The running scale that normalises the policy's loss."""
 
 from __future__ import annotations
 

@@ -1,15 +1,19 @@
 """Networks: plain tensors in, plain tensors out."""
 
+from torchrl_etdmpc.modules.action_value_model import ActionValueWorldModel
 from torchrl_etdmpc.modules.dynamics import DynamicsEnsemble
 from torchrl_etdmpc.modules.encoder import Encoder
-from torchrl_etdmpc.modules.heads import RewardHead, TerminationHead, ValueEnsemble
+from torchrl_etdmpc.modules.heads import ActionValueEnsemble, RewardHead, TerminationHead, ValueEnsemble
 from torchrl_etdmpc.modules.normed_linear import MLP, Activation, EnsembleLinear, NormedLinear
-from torchrl_etdmpc.modules.policy import GaussianPolicy
-from torchrl_etdmpc.modules.prediction import PolicyModel, PredictionModel, device_and_dtype
+from torchrl_etdmpc.modules.policy import GaussianPolicy, SquashedGaussianPolicy
+from torchrl_etdmpc.modules.prediction import ActionValueModel, PolicyModel, PredictionModel, device_and_dtype
 from torchrl_etdmpc.modules.world_model import WorldModel
 
 __all__ = [
     "MLP",
+    "ActionValueEnsemble",
+    "ActionValueModel",
+    "ActionValueWorldModel",
     "Activation",
     "DynamicsEnsemble",
     "Encoder",
@@ -19,6 +23,7 @@ __all__ = [
     "PolicyModel",
     "PredictionModel",
     "RewardHead",
+    "SquashedGaussianPolicy",
     "TerminationHead",
     "ValueEnsemble",
     "WorldModel",

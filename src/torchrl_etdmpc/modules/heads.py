@@ -1,4 +1,4 @@
-"""Prediction heads: reward, value ensemble, termination."""
+"""Prediction heads: reward, value ensembles, termination."""
 
 from __future__ import annotations
 
@@ -80,6 +80,56 @@ class ValueEnsemble(LayerStack):
     def forward(self, latent: Tensor, *, dropout: bool = False) -> Tensor:
         """``latent [..., L]`` to logits ``[V, ..., M]``; dropout (independent per head) only when asked for."""
         return self.through(latent.expand(self.num_heads, *latent.shape), dropout=dropout)
+
+
+class ActionValueEnsemble(LayerStack):
+    """``V`` independent action-value heads, latent and action to symlog two-hot logits (TD-MPC2, arXiv:2310.16828).
+
+    Args:
+        latent_dim (int): L.
+        action_dim (int): A.
+        num_heads (int): V.
+        num_bins (int): M.
+        hidden_dim (int): size of both hidden layers.
+        dropout (float): of the first hidden layer, when ``forward`` is asked for it.
+        activation (str): of the hidden layers.
+
+    >>> ActionValueEnsemble(16, 2, num_heads=5)(torch.zeros(7, 16), torch.zeros(7, 2)).shape
+    torch.Size([5, 7, 101])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        *,
+        num_heads: int = 5,
+        num_bins: int = 101,
+        hidden_dim: int = 512,
+        dropout: float = 0.01,
+        activation: Activation = "mish",
+    ) -> None:
+        super().__init__(
+            latent_dim + action_dim,
+            [hidden_dim] * 2,
+            num_bins,
+            activation=activation,
+            num_members=num_heads,
+            dropout=dropout,
+            zero_init_output=True,
+        )
+        self.num_heads = num_heads
+
+    def forward(self, latent: Tensor, action: Tensor, *, dropout: bool = False) -> Tensor:
+        """``latent [..., L]`` and ``action [..., A]`` to logits ``[V, ..., M]``.
+
+        Args:
+            latent (Tensor): ``[..., L]``.
+            action (Tensor): broadcastable to ``[..., A]``.
+            dropout (bool): whether to use it, independently per head.
+        """
+        rows = torch.cat([latent, action.expand(*latent.shape[:-1], action.shape[-1])], dim=-1)
+        return self.through(rows.expand(self.num_heads, *rows.shape), dropout=dropout)
 
 
 class TerminationHead(LayerStack):

@@ -61,5 +61,32 @@ class GaussianPolicy(LayerStack):
         Returns:
             tuple[Tensor, Tensor]: mean in (-1, 1) and log std, both of shape ``[..., A]``.
         """
+        mean, log_std = self._gaussian(latent, log_std_bounds)
+        return mean.tanh(), log_std
+
+    def _gaussian(self, latent: Tensor, log_std_bounds: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
         mean, raw = self.through(latent).chunk(2, dim=-1)
-        return mean.tanh(), bounded_log_std(raw, *(log_std_bounds or self.log_std_bounds))
+        return mean, bounded_log_std(raw, *(log_std_bounds or self.log_std_bounds))
+
+
+class SquashedGaussianPolicy(GaussianPolicy):
+    """Latent to a Gaussian that a tanh squashes into [-1, 1] (TD-MPC2, arXiv:2310.16828).
+
+    An action is ``tanh(m + std * eps)``. Called, it answers as every policy does, with ``mean = tanh(m)``, the action
+    without noise, and the log standard deviation before the tanh.
+
+    Args:
+        latent_dim (int): L.
+        action_dim (int): A.
+        **options: as of :class:`GaussianPolicy`.
+
+    >>> import torch
+    >>> policy = SquashedGaussianPolicy(16, 2, log_std_min=-10.0, log_std_max=2.0)
+    >>> mean, log_std = policy.before_tanh(torch.zeros(7, 16))
+    >>> torch.equal(policy(torch.zeros(7, 16))[0], mean.tanh())
+    True
+    """
+
+    def before_tanh(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and log std of the Gaussian before the tanh, both of shape ``[..., A]``."""
+        return self._gaussian(latent, log_std_bounds)

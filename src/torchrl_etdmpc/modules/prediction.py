@@ -96,6 +96,26 @@ class PolicyModel(PredictionModel, Protocol):
         ...
 
 
+@runtime_checkable
+class ActionValueModel(PolicyModel, Protocol):
+    """A world model whose critic also reads the action; the planner knows it by the members below.
+
+    Its :meth:`~PredictionModel.values` are those of an action of its own choice, without noise, for whoever asks for
+    the value of a latent. The planner asks for :meth:`action_values` of actions that it samples from the policy.
+
+    >>> from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
+    >>> isinstance(ActionValueWorldModel(3, 2), ActionValueModel), isinstance(WorldModel(3, 2), ActionValueModel)
+    (True, False)
+    """
+
+    num_values: int
+    """V, action-value heads."""
+
+    def action_values(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Expected discounted return of ``action [..., A]`` in ``latent [..., L]`` by each head, ``[..., V]``."""
+        ...
+
+
 def has_policy(model: object) -> TypeGuard[PolicyModel]:
     """Whether a model has a policy, which is more than planning needs.
 

@@ -84,7 +84,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
                     reward_coef=reward_coef,
                     termination_coef=termination_coef,
                 ),
-                value_term(self, value_coef=value_coef, discount=discount),
+                value_term(self, world_model, value_coef=value_coef, discount=discount),
                 policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),
             ],
             extra_terms=extra_terms,
@@ -99,18 +99,3 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         """Draws new weights for every network, made by no update yet; the targets become copies of the new ones."""
         super().reset_parameters_recursive()
         self.world_model.version.zero_()
-
-    @property
-    def distill(self) -> bool:
-        """Whether the policy term is computed."""
-        return self._distill
-
-    @distill.setter
-    def distill(self, value: bool) -> None:
-        self._distill = bool(value)
-        self._in_keys = None
-
-    @property
-    def active_terms(self) -> tuple[Term, ...]:
-        """The terms that :meth:`forward` evaluates; that of the policy only while :attr:`distill` is on."""
-        return self.terms if self._distill else tuple(term for term in self.terms if term.name != "policy")

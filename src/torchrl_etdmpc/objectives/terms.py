@@ -141,6 +141,8 @@ class LatentRolloutLoss(LossModule):
     at ``td_error``, for ``buffer.update_tensordict_priority(batch)``: the only entry that a loss writes to its input.
     ``loss.use_prioritized_weights = False`` leaves the weights aside. A loss without values has no priority to offer.
 
+    The term named ``"policy"`` can be turned off: ``loss.distill = False``, while pretraining on random data, say.
+
     Args:
         world_model (WorldModel): the networks, shared with the caller.
         terms (sequence of Term): in the order in which they are evaluated.
@@ -216,6 +218,7 @@ class LatentRolloutLoss(LossModule):
     discount: Tensor
     entropy_coef: Tensor
     kl_scale: Tensor
+    q_scale: Tensor
     scale_tau: float
     kl_direction: KLDirection
 
@@ -264,6 +267,7 @@ class LatentRolloutLoss(LossModule):
                 self.add_module(term.name, term.function)
         self.register_buffer("rho", torch.tensor(float(rho)))
         self.ignore_termination = ignore_termination
+        self.distill = True
         count_updates(world_model, self.parameters())
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -326,9 +330,19 @@ class LatentRolloutLoss(LossModule):
         return found
 
     @property
+    def distill(self) -> bool:
+        """Whether the policy term is computed."""
+        return self._distill
+
+    @distill.setter
+    def distill(self, value: bool) -> None:
+        self._distill = bool(value)
+        self._in_keys = None
+
+    @property
     def active_terms(self) -> tuple[Term, ...]:
-        """The terms that :meth:`forward` evaluates."""
-        return self.terms
+        """The terms that :meth:`forward` evaluates; that of the policy only while :attr:`distill` is on."""
+        return self.terms if self._distill else tuple(term for term in self.terms if term.name != "policy")
 
     def _reads(self) -> dict[NestedKey, NestedKey]:
         """Where each field of the slices is read, and each further key of the terms."""

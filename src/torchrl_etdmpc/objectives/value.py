@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
-from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term
 
@@ -124,19 +124,25 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
     ) -> None:
         super().__init__(
             world_model,
-            [value_term(self, value_coef=value_coef, discount=discount)],
+            [value_term(self, world_model, value_coef=value_coef, discount=discount)],
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,
         )
 
 
-def value_term(loss: LatentRolloutLoss, *, value_coef: float, discount: float) -> Term:
+def value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: float, discount: float) -> Term:
     """The term of the value heads, for any loss.
 
     Raises:
+        TypeError: if the value heads read actions.
         ValueError: if the discount is out of range.
     """
+    if isinstance(world_model, ActionValueWorldModel):
+        raise TypeError(
+            f"world_model must have state values, got {type(world_model).__name__}; train its action values with "
+            "TDMPC2Loss."
+        )
     if not 0 < discount <= 1:
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
     return Term(

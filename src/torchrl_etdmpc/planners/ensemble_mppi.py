@@ -42,7 +42,7 @@ from torchrl_etdmpc.keys import (
     VALUE,
     VERSION,
 )
-from torchrl_etdmpc.modules.prediction import PredictionModel, has_policy
+from torchrl_etdmpc.modules.prediction import ActionValueModel, PredictionModel, has_policy
 from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
@@ -67,6 +67,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     at every reset and without which rollouts and collectors drop it. Where the input holds an ``InitTracker``'s
     ``is_init``, a plan is zeroed at the start of its episode in any case. With no plan in the input the planner starts
     cold, and warns once unless all episodes have just begun.
+
+    With an :class:`~torchrl_etdmpc.modules.ActionValueModel`, rollouts are bootstrapped as TD-MPC2 does: by two heads,
+    drawn anew in every iteration, for actions sampled from the policy.
 
     Args:
         env (LatentEnv): the world model as an environment. Any
@@ -195,6 +198,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.next_plan_mean_key = unravel_key((NEXT, plan_mean_key))
         self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}
         self._warned_cold = False
+        # Asked once: the compiler cannot ask a Protocol.
+        self._num_action_values = env.world_model.num_values if isinstance(env.world_model, ActionValueModel) else 0
         carried = [self.is_init_key, self.plan_mean_key] if warm_start else []
         written = [*self.plan_keys.values(), *([self.next_plan_mean_key] if warm_start else [])]
         # TorchRL's types know one key only.
@@ -385,11 +390,21 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         options: dict[str, Any] = {"device": device, "dtype": dtype}
         if generator is not None:  # torch.randn(..., generator=None) takes no symbolic size
             options["generator"] = generator
+        drawn = {
+            "proposals": torch.randn(*batch_size, self.num_proposals, *actions, **options),
+            "candidates": torch.randn(*batch_size, self.iterations, free, *actions, **options),
+            "elite": torch.rand(*batch_size, self.num_elites, **options),
+            "action": torch.randn(*batch_size, actions[-1], **options),
+        }
+        if not self._num_action_values:
+            nothing = torch.zeros(*batch_size, 0, device=device, dtype=dtype)
+            return PlanNoise(**drawn, bootstrap=nothing, heads=nothing)
+        depths = self.horizon if self.score.depths == "all" else 1
+        scored = (self.iterations, self.num_samples, depths, self.world_model.num_dynamics, actions[-1])
         return PlanNoise(
-            proposals=torch.randn(*batch_size, self.num_proposals, *actions, **options),
-            candidates=torch.randn(*batch_size, self.iterations, free, *actions, **options),
-            elite=torch.rand(*batch_size, self.num_elites, **options),
-            action=torch.randn(*batch_size, actions[-1], **options),
+            **drawn,
+            bootstrap=torch.randn(*batch_size, *scored, **options),
+            heads=torch.rand(*batch_size, self.iterations, self._num_action_values, **options),
         )
 
     @torch.no_grad()
@@ -454,10 +469,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             actions = sample_sequences(gaussian, noise.candidates[:, iteration])
             if proposed is None:
                 actions = torch.cat([proposals, actions], dim=1)
-                scores, returns = self._evaluate(latent, actions, weights_cast)
+                scores, returns = self._evaluate(latent, actions, weights_cast, noise, iteration)
                 proposed = proposals, scores[:, : self.num_proposals], returns[:, : self.num_proposals]
-            else:  # the proposals keep the scores of the first iteration
-                drawn = actions, *self._evaluate(latent, actions, weights_cast)
+            else:
+                # Departure from TD-MPC2, which scores the proposals anew in every iteration: they keep the scores of
+                # the first one, which differ from the later ones by other draws alone.
+                drawn = actions, *self._evaluate(latent, actions, weights_cast, noise, iteration)
                 actions, scores, returns = (torch.cat(pair, dim=1) for pair in zip(proposed, drawn, strict=True))
             elites = select_elites(actions, scores, self.num_elites)
             weights = elite_weights(elites.scores, self.inverse_temperature)
@@ -514,10 +531,20 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         return {name: weight.to(self.scoring_dtype) for name, weight in self._imagination.named_parameters()}
 
     def _evaluate(
-        self, latent: Tensor, actions: Tensor, weights_cast: dict[str, Tensor] | None
+        self,
+        latent: Tensor,
+        actions: Tensor,
+        weights_cast: dict[str, Tensor] | None,
+        noise: PlanNoise,
+        iteration: int,
     ) -> tuple[Tensor, Tensor]:
         """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]`` from ``[B, L]``."""
-        options = {"discount": self.discount, "all_depths": self.score.depths == "all"}
+        options: dict[str, Any] = {"discount": self.discount, "all_depths": self.score.depths == "all"}
+        if noise.heads.shape[-1]:
+            drawn = noise.bootstrap[:, iteration, -actions.shape[1] :]
+            if weights_cast is not None:
+                drawn = drawn.to(self.scoring_dtype)
+            options["bootstrap"] = drawn, noise.heads[:, iteration]
         if weights_cast is None:
             returns = self._imagination(latent, actions, **options)
         else:
@@ -554,8 +581,8 @@ class _Imagination(nn.Module):
         super().__init__()
         self.world_model = world_model
 
-    def forward(self, latent: Tensor, actions: Tensor, *, discount: float, all_depths: bool) -> Tensor:
-        return imagined_returns(self.world_model, latent, actions, discount=discount, all_depths=all_depths)
+    def forward(self, latent: Tensor, actions: Tensor, **options: Any) -> Tensor:
+        return imagined_returns(self.world_model, latent, actions, **options)
 
 
 def _check_budget(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrl_etdmpc.functional import return_table
-from torchrl_etdmpc.modules.prediction import PolicyModel, PredictionModel
+from torchrl_etdmpc.modules.prediction import ActionValueModel, PolicyModel, PredictionModel
 
 
 def propose_sequences(
@@ -41,7 +43,13 @@ def propose_sequences(
 
 
 def imagined_returns(
-    world_model: PredictionModel, latent: Tensor, actions: Tensor, *, discount: float, all_depths: bool
+    world_model: PredictionModel,
+    latent: Tensor,
+    actions: Tensor,
+    *,
+    discount: float,
+    all_depths: bool,
+    bootstrap: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """Return table of candidates, each dynamics head on its own rollout (thesis Eq. 3.1).
 
@@ -53,15 +61,41 @@ def imagined_returns(
         actions (Tensor): candidates, ``[B, N, H, A]``.
         discount (float): gamma.
         all_depths (bool): whether to bootstrap at every depth, or at the last one only.
+        bootstrap (tuple of Tensor, optional): with an :class:`~torchrl_etdmpc.modules.ActionValueModel`, what
+            :func:`sampled_values` draws with. Default: the model's own values.
 
     Returns:
-        Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for the last depth only.
+        Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for the last depth only; V = 2 with ``bootstrap``.
     """
     latents = _rolled(world_model, latent, actions)
-    values = world_model.values(torch.stack(latents if all_depths else latents[-1:]))  # [D, F, B, N, V]
+    reached = torch.stack(latents if all_depths else latents[-1:])
+    if bootstrap is None:
+        values = world_model.values(reached)  # [D, F, B, N, V]
+    else:
+        values = sampled_values(cast("ActionValueModel", world_model), reached, *bootstrap)
     rewards = _rewards_along(world_model, latent, latents, actions)
     alive = _survival(world_model, latents)
     return return_table(rewards.permute(2, 3, 0, 1), values.permute(2, 3, 0, 1, 4), discount, alive)
+
+
+def sampled_values(world_model: ActionValueModel, latent: Tensor, noise: Tensor, heads: Tensor) -> Tensor:
+    """Values of latents by two of the action-value heads, for actions of the policy (TD-MPC2, arXiv:2310.16828).
+
+    ``Q_j(z, a)`` with ``a ~ pi(z)``; a score's mean over heads is the average of the two.
+
+    Args:
+        world_model (ActionValueModel): policy and action values.
+        latent (Tensor): ``[D, F, B, N, L]``.
+        noise (Tensor): standard normal draws for the policy, ``[B, N, D, F, A]``.
+        heads (Tensor): uniform draws, ``[B, V]``; the two largest pick the heads of a state.
+
+    Returns:
+        Tensor: ``[D, F, B, N, 2]``, or all heads if there are fewer.
+    """
+    action = world_model.act(latent, noise.permute(2, 3, 0, 1, 4))
+    values = world_model.action_values(latent, action)
+    picked = heads.topk(min(2, heads.shape[-1])).indices  # [B, 2]
+    return values.gather(-1, picked.unsqueeze(1).expand(*values.shape[:-1], -1))
 
 
 def _rolled(world_model: PredictionModel, latent: Tensor, actions: Tensor) -> list[Tensor]:

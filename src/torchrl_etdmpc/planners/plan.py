@@ -18,6 +18,11 @@ class PlanNoise(NamedTuple):
     """Uniform on [0, 1), ``[..., K]``: picks the elite."""
     action: Tensor
     """Standard normal, ``[..., A]``: the exploration of a training action."""
+    bootstrap: Tensor
+    """Standard normal, ``[..., I, N, D, F, A]``: the policy's action at every latent where an
+    :class:`~torchrl_etdmpc.modules.ActionValueModel` bootstraps. Any other model draws nothing: ``[..., 0]``."""
+    heads: Tensor
+    """Uniform on [0, 1), ``[..., I, V]``: the largest pick the heads that bootstrap; likewise ``[..., 0]``."""
 
 
 class PlanTrace(NamedTuple):

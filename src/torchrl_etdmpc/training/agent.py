@@ -9,11 +9,18 @@ from typing import Any
 import torch
 
 from torchrl_etdmpc.functional import discount_from_episode_length
-from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss, LatentRolloutLoss, TDMPC2Loss
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
 from torchrl_etdmpc.training.compilation import compile_call, resolve_compile
-from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig, arguments, named_settings
+from torchrl_etdmpc.training.config import (
+    LossConfig,
+    ModelConfig,
+    PlannerConfig,
+    TrainConfig,
+    arguments,
+    named_settings,
+)
 from torchrl_etdmpc.training.own_code import own_code
 from torchrl_etdmpc.training.updater import Updater
 
@@ -26,7 +33,7 @@ class Agent:
     planner: EnsembleMPPIPlanner
     eval_planner: EnsembleMPPIPlanner
     reanalyze_planner: EnsembleMPPIPlanner
-    loss: EfficientTDMPCLoss
+    loss: LatentRolloutLoss
     updater: Updater
     compile_mode: str | None = None
 
@@ -68,8 +75,33 @@ def build_world_model(
         terminates (bool): whether the task's episodes can end before their time limit. Default: ``False``.
     """
     termination = terminates if config.termination is None else config.termination
+    sizes = arguments(config, "termination", "action_values")
     with named_settings("model", config):
-        return WorldModel(observation_dim, action_dim, termination=termination, **arguments(config, "termination"))
+        made_of = ActionValueWorldModel if config.action_values else WorldModel
+        return made_of(observation_dim, action_dim, termination=termination, **sizes)
+
+
+def build_loss(
+    world_model: WorldModel, config: LossConfig, *, discount: float, ignore_termination: bool
+) -> LatentRolloutLoss:
+    """The loss that trains a world model: :class:`TDMPC2Loss` if it has action values.
+
+    Args:
+        world_model (WorldModel): the networks.
+        config (LossConfig): the group.
+
+    Keyword Args:
+        discount (float): gamma.
+        ignore_termination (bool): whether to accept rows that terminate without a termination head.
+    """
+    path = config.extra_terms
+    options: dict[str, Any] = {"discount": discount, "scale_tau": config.tau, "ignore_termination": ignore_termination}
+    options["extra_terms"] = [] if path is None else own_code("loss.extra_terms", path)(world_model)
+    elsewhere = ("slice_len", "tau", "discount", "extra_terms")
+    with named_settings("loss", config, scale_tau="tau"):
+        if isinstance(world_model, ActionValueWorldModel):
+            return TDMPC2Loss(world_model, **options, **arguments(config, *elsewhere, "kl_direction"))
+        return EfficientTDMPCLoss(world_model, **options, **arguments(config, *elsewhere, "squashed_entropy"))
 
 
 def build_planner(
@@ -124,17 +156,8 @@ def build_agent(
     if discount is None:
         discount = discount_from_episode_length(task.decision_steps_per_episode)
     world_model = build_world_model(config.model, observation_dim, action_dim, terminates=task.terminates).to(device)
-    terms = config.loss.extra_terms
-    extra_terms = [] if terms is None else own_code("loss.extra_terms", terms)(world_model)
-    with named_settings("loss", config.loss, scale_tau="tau"):
-        loss = EfficientTDMPCLoss(
-            world_model,
-            discount=discount,
-            scale_tau=config.loss.tau,
-            ignore_termination=config.model.termination is False,
-            extra_terms=extra_terms,
-            **arguments(config.loss, "slice_len", "tau", "discount", "extra_terms"),
-        )
+    ignore = config.model.termination is False
+    loss = build_loss(world_model, config.loss, discount=discount, ignore_termination=ignore)
     with named_settings("optim", config.optim):
         optim = arguments(config.optim, "batch_size", "updates_per_decision")
         updater = Updater(loss, tau=config.loss.tau, compile_mode=compile_mode, **optim)

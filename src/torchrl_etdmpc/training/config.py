@@ -47,6 +47,9 @@ class ModelConfig:
     log_std_min: float = -3.0
     log_std_max: float = 1.0
     activation: Activation = "mish"
+    action_values: bool = False
+    """Whether the value heads read the action too, as in TD-MPC2: the policy then maximises them, its actions squashed
+    by a tanh, and learns nothing from plans."""
     termination: bool | None = None
     """Whether there is a termination head. Default: if the task can end before its time limit. ``false`` on such a task
     bootstraps through its ends, as BMPC's code does."""
@@ -114,6 +117,9 @@ class LossConfig:
     entropy_coef: float = 1e-4
     """Weight of the policy's entropy."""
     kl_direction: KLDirection = "backward"
+    squashed_entropy: bool = True
+    """With action values: whether the entropy is that of the squashed actions; ``false`` is that of the Gaussian before
+    the tanh, as in TD-MPC2's code."""
     tau: float = 0.01
     """Rate of the target values and of the running scale."""
     discount: float | None = None
@@ -154,7 +160,9 @@ class ReplayConfig:
     seed_decisions: int | None = None
     """Length of the random phase: decisions of uniform random actions. Default: max(1000, 5 episodes)."""
     pretrain_updates: int | None = None
-    """Updates without the policy loss after the random phase. Default: as many as it had decisions."""
+    """Updates after the random phase. Default: as many as it had decisions."""
+    pretrain_policy: bool = False
+    """Whether these train the policy too, as in TD-MPC2; from random plans it would learn to be random."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +172,8 @@ class TrainConfig:
     task: str = "walker-walk"
     """A task of DMC, gym/ID for one of Gymnasium, or module:function for your own."""
     preset: str = "efficient-tdmpc"
-    """The values to begin with: efficient-tdmpc, efficient-tdmpc-utd2, efficient-tdmpc-utd4 and bmpc are for a GPU, cpu
-    learns on a CPU in minutes."""
+    """The values to begin with: efficient-tdmpc, efficient-tdmpc-utd2, efficient-tdmpc-utd4, bmpc and tdmpc2 are for a
+    GPU, cpu and tdmpc2-cpu learn on a CPU in minutes."""
     seed: int = 1
     """Of all random numbers."""
     total_env_steps: int = 200_000
@@ -296,7 +304,7 @@ class TrainConfig:
 
     @property
     def pretrain_updates(self) -> int:
-        """Updates without the policy loss after the random phase."""
+        """Updates between the random phase and learning."""
         return self.seed_decisions if self.replay.pretrain_updates is None else self.replay.pretrain_updates
 
     @property

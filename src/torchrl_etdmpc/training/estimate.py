@@ -58,8 +58,9 @@ def what_it_takes(config: TrainConfig, device: torch.device, env_steps: int = 0)
     seconds = estimated_seconds(config) * (1 - env_steps / config.total_env_steps)
     compiled = "" if config.compile == "off" else ", and before it some minutes to compile the first time"
     line = f"about {_duration(seconds)} on this CPU{compiled}"
-    if config.preset != "cpu" and seconds > 3600:
-        line += f"; preset={config.preset} is made for a GPU and there is none here: preset=cpu learns in minutes"
+    small = "tdmpc2-cpu" if config.model.action_values else "cpu"
+    if config.preset not in ("cpu", "tdmpc2-cpu") and seconds > 3600:
+        line += f"; preset={config.preset} is made for a GPU and there is none here: preset={small} learns in minutes"
     return line
 
 

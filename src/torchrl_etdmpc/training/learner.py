@@ -103,11 +103,11 @@ class Learner:
             raise error
         warnings.warn(f"{error}; training goes on with a fresh episode (failure {self.faults}).", stacklevel=3)
 
-    def update(self, *, distill: bool = True) -> None:
-        """One gradient step on a fresh sample."""
+    def update(self, *, distill: bool = True, measured: bool = True) -> None:
+        """One gradient step on a fresh sample, of the policy too with ``distill``; counted in the row if measured."""
         batch = self.replay.sample().to(self.agent.device).reshape(-1, self.config.loss.slice_len)
         metrics = self.agent.updater.step(batch, distill=distill)
-        if distill:
+        if measured:
             self._updates.add(dict(metrics.items()))
             if self.reanalyze is not None and self.reanalyze.target_age is not None:
                 self._updates.add({"target_age": self.reanalyze.target_age})
@@ -118,11 +118,11 @@ class Learner:
             self.update()
 
     def pretrain(self) -> Iterator[None]:
-        """Updates of world model and value on the random data, one at a time; it teaches the policy nothing."""
+        """Updates on the random data, one at a time; of the policy only with ``replay.pretrain_policy``."""
         if self.reanalyze is not None:
             self.reanalyze.enabled = False
         while self.pretrained < self.config.pretrain_updates:
-            self.update(distill=False)
+            self.update(distill=self.config.replay.pretrain_policy, measured=False)
             self.pretrained += 1
             yield
         if self.reanalyze is not None:

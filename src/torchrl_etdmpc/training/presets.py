@@ -27,6 +27,26 @@ def _efficient_tdmpc(name: str, updates_per_decision: int, reanalyze_every: int)
     )
 
 
+# TD-MPC2 (arXiv:2310.16828) with its 5M parameters; what is not here, it shares with BMPC.
+_TDMPC2_MODEL: dict[str, Any] = {
+    "action_values": True,
+    "num_dynamics": 1,
+    "num_values": 5,
+    "log_std_min": -10.0,
+    "log_std_max": 2.0,
+}
+_TDMPC2_PLANNER: dict[str, Any] = {"horizon": 3, "score": "final", "eval_first_action": "elite"}
+# Sizes and budgets that a CPU core learns with in minutes.
+_CPU_RUN: dict[str, Any] = {
+    "total_env_steps": 50_000,
+    "eval_every": 10_000,
+    "threads": 1,
+    "loss": LossConfig(tau=0.03),
+    "optim": OptimConfig(batch_size=64, lr=1e-3),
+}
+_CPU_MODEL: dict[str, Any] = {"latent_dim": 64, "mlp_dim": 64, "encoder_dim": 128, "activation": "silu"}
+_CPU_PLANNER: dict[str, Any] = {"num_samples": 48, "num_elites": 10, "num_proposals": 4, "iterations": 3}
+
 PRESETS: dict[str, TrainConfig] = {
     config.preset: config
     for config in (
@@ -41,20 +61,31 @@ PRESETS: dict[str, TrainConfig] = {
             replay=ReplayConfig(insertion="episode"),
         ),
         _preset(
+            "tdmpc2",
+            model=ModelConfig(**_TDMPC2_MODEL),
+            planner=PlannerConfig(**_TDMPC2_PLANNER),
+            reanalyze=ReanalyzeConfig(every=0),
+            replay=ReplayConfig(insertion="episode", pretrain_policy=True),
+        ),
+        _preset(
             "cpu",
-            total_env_steps=50_000,
-            eval_every=10_000,
-            threads=1,
-            model=ModelConfig(latent_dim=64, mlp_dim=64, encoder_dim=128, num_dynamics=2, activation="silu"),
-            planner=PlannerConfig(horizon=3, num_samples=48, num_elites=10, num_proposals=4, iterations=3),
+            **_CPU_RUN,
+            model=ModelConfig(num_dynamics=2, **_CPU_MODEL),
+            planner=PlannerConfig(horizon=3, **_CPU_PLANNER),
             reanalyze=ReanalyzeConfig(
                 num_samples=24, num_elites=6, num_proposals=2, iterations=3, every=10, num_slices=6
             ),
-            loss=LossConfig(tau=0.03),
-            optim=OptimConfig(batch_size=64, lr=1e-3),
             # Departure from BMPC and the thesis, which pretrain with as many updates as the seed phase had decisions:
             # 1,000 for its 2,500, for the time that a CPU takes.
             replay=ReplayConfig(pretrain_updates=1000),
+        ),
+        _preset(
+            "tdmpc2-cpu",
+            **_CPU_RUN,
+            model=ModelConfig(**_TDMPC2_MODEL, **_CPU_MODEL),
+            planner=PlannerConfig(**_TDMPC2_PLANNER, **_CPU_PLANNER),
+            reanalyze=ReanalyzeConfig(every=0),
+            replay=ReplayConfig(insertion="episode", pretrain_policy=True, pretrain_updates=1000),
         ),
     )
 }

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Slices
+from torchrl_etdmpc.objectives import LatentRolloutLoss, Slices
 from torchrl_etdmpc.training.compilation import compile_call, tracing_gradients
 
 _CLIPPED_TOGETHER = {"model": ("encoder", "heads", "values"), "policy": ("policy",)}
@@ -35,7 +35,9 @@ class Updater:
     (``.to()``, ``copy.deepcopy``) need a new updater; :meth:`step` says so.
 
     Args:
-        loss (EfficientTDMPCLoss): on the device and in the dtype that it will keep.
+        loss (LatentRolloutLoss): of encoder, dynamics, value heads with targets, and policy, e.g.
+            :class:`~torchrl_etdmpc.objectives.EfficientTDMPCLoss` or :class:`~torchrl_etdmpc.objectives.TDMPC2Loss`; on
+            the device and in the dtype that it will keep.
 
     Keyword Args:
         lr (float): learning rate. Default: 3e-4.
@@ -49,6 +51,7 @@ class Updater:
         ValueError: if an argument is out of range, or parameters differ in dtype or device.
 
     >>> from torchrl_etdmpc.modules import WorldModel
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
     >>> from torchrl_etdmpc.testing import random_slices
     >>> updater = Updater(EfficientTDMPCLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=32), discount=0.99))
     >>> updater.step(random_slices(3, 2))["grad_norm_policy"].isfinite().item()
@@ -57,7 +60,7 @@ class Updater:
 
     def __init__(
         self,
-        loss: EfficientTDMPCLoss,
+        loss: LatentRolloutLoss,
         *,
         lr: float = 3e-4,
         encoder_lr_scale: float = 0.3,
@@ -152,13 +155,14 @@ class Updater:
         """
         if self._compiled is None:
             return
-        distill, scale = self.loss.distill, self.loss.kl_scale.clone()
+        distill, buffers = self.loss.distill, [(buffer, buffer.clone()) for buffer in self.loss.buffers()]
         self.loss.distill = True
         try:
             with tracing_gradients():
                 self._compiled(self.loss.slices(batch), self.loss.targets())
         finally:
-            self.loss.kl_scale.copy_(scale)
+            for buffer, before in buffers:  # the running scale is one of them
+                buffer.copy_(before)
             self.loss.distill = distill
 
     def make_eager(self) -> None:
@@ -173,7 +177,8 @@ class Updater:
         All of it is one graph when it is compiled, so nothing here may wait for the device or depend on a value.
         """
         # Departure from BMPC and TD-MPC2, which make two backward passes, the model's and then the policy's: neither
-        # loss sends a gradient into what the other one trains, so the gradient of the sum is both.
+        # loss sends a gradient into what the other one trains, so the gradient of the sum is both. (A policy that
+        # maximises action values does it with those of before the model's step, in TD-MPC2 with those of after it.)
         out = self.loss.evaluate(slices, targets)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
@@ -215,7 +220,7 @@ class Updater:
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
 
 
-def _parts(loss: EfficientTDMPCLoss) -> dict[str, list[nn.Parameter]]:
+def _parts(loss: LatentRolloutLoss) -> dict[str, list[nn.Parameter]]:
     """The parameters by how they are trained: what has no rule of its own is trained as the heads are."""
     parts: dict[str, list[nn.Parameter]] = {"encoder": [], "heads": [], "values": [], "policy": []}
     first = next(loss.parameters())

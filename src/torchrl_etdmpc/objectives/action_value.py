@@ -1,0 +1,143 @@
+"""The action-value loss: TD targets of replayed rewards, and the least of two target heads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import functional_call
+
+from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
+from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Term
+
+
+def draw_two_heads(num_heads: int, device: torch.device) -> Tensor:
+    """Indices of two different heads, all pairs alike; of the only one if there is no second, shape ``[2]`` or ``[1]``.
+
+    >>> len(set(draw_two_heads(5, torch.device("cpu")).tolist()))
+    2
+    """
+    return torch.rand(num_heads, device=device).topk(min(2, num_heads)).indices
+
+
+@torch.no_grad()
+def action_value_target(
+    world_model: ActionValueWorldModel,
+    target_values: Callable[[Tensor, Tensor], Tensor],
+    latent: Tensor,
+    reward: Tensor,
+    terminated: Tensor | None,
+    noise: Tensor,
+    heads: Tensor,
+    discount: float | Tensor,
+) -> Tensor:
+    """TD target of a replayed step (TD-MPC2, arXiv:2310.16828).
+
+    ``y = r + gamma (1 - d) min_{j in heads} Qbar_j(z', a')``, ``a' ~ pi(z')``, at the encoded next latent z'.
+
+    Args:
+        world_model (ActionValueWorldModel): the policy.
+        target_values (callable): the target heads, latents ``[..., L]`` and actions ``[..., A]`` to values
+            ``[..., V]``.
+        latent (Tensor): the encoded next latents z', ``[..., L]``.
+        reward (Tensor): replayed rewards r, ``[...]``.
+        terminated (Tensor, optional): whether the step ended its episode, d, ``[...]``. Default: it never does.
+        noise (Tensor): standard normal draws for the policy's action, ``[..., A]``.
+        heads (Tensor): indices of the heads of which the least counts.
+        discount (float or Tensor): gamma.
+
+    Returns:
+        Tensor: targets in the units of the return, without gradient, ``[...]``.
+    """
+    bootstrap = target_values(latent, world_model.act(latent, noise)).index_select(-1, heads).amin(-1)
+    if terminated is not None:
+        bootstrap = torch.where(terminated, 0, bootstrap)
+    return reward + discount * bootstrap
+
+
+def action_value_error(
+    world_model: ActionValueWorldModel, rollout: LatentRollout, slices: Slices, target: Tensor, *, dropout: bool
+) -> Tensor:
+    """Cross-entropy of every head for the replayed action on every rollout, ``CE(Q_j(zhat_{k,i}, a_k), y_k)``.
+
+    Args:
+        world_model (ActionValueWorldModel): the action-value heads.
+        rollout (LatentRollout): T steps of F heads.
+        slices (Slices): the replayed actions.
+        target (Tensor): y, ``[T, B]``.
+        dropout (bool): whether the action-value heads use dropout.
+
+    Returns:
+        Tensor: mean over value and dynamics heads, ``[T, B]``.
+    """
+    heads = world_model.num_dynamics
+    rows = head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads)
+    logits = world_model.value_head(*rows, dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
+    error = two_hot_cross_entropy(logits, head_rows(target, heads), world_model.bins)
+    return mean_of_head_rows(error.mean(0), heads)
+
+
+@torch.no_grad()
+def action_td_error(
+    world_model: ActionValueWorldModel, rollout: LatentRollout, slices: Slices, target: Tensor
+) -> Tensor:
+    """Distance of the action values from their targets, ``mean_{i,j} |Q_j(zhat_{k,i}, a_k) - y_k|``, ``[T, B]``."""
+    heads = world_model.num_dynamics
+    values = world_model.action_values(head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads))
+    return mean_of_head_rows((values - head_rows(target, heads).unsqueeze(-1)).abs().mean(-1), heads)
+
+
+def action_value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: float, discount: float) -> Term:
+    """The term of the action-value heads, for any loss.
+
+    Raises:
+        TypeError: if the world model has no action values.
+        ValueError: if the discount is out of range.
+    """
+    if not isinstance(world_model, ActionValueWorldModel):
+        raise TypeError(
+            f"world_model must have action values, got {type(world_model).__name__}; build an ActionValueWorldModel."
+        )
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
+    return Term(
+        "value",
+        partial(_action_value, loss),
+        value_coef,
+        networks=("encoder", "dynamics", "value"),
+        targets=("value",),
+        keys=("reward",) if world_model.termination_head is None else ("reward", "terminated"),
+        metrics=("value_error", "value_target"),
+        scalars={"discount": discount},
+    )
+
+
+def _action_value(
+    loss: LatentRolloutLoss, world_model: Any, slices: Slices, rollout: LatentRollout
+) -> tuple[Tensor, dict[str, Tensor]]:
+    targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
+    assert slices.reward is not None
+
+    def values(latent: Tensor, action: Tensor) -> Tensor:
+        logits = functional_call(loss.value, targets["value"], (latent, action))
+        return two_hot_decode(logits, world_model.bins).movedim(0, -1)
+
+    target = action_value_target(
+        world_model,
+        values,
+        rollout.encoded[1:],
+        slices.reward,
+        slices.terminated,
+        torch.randn_like(slices.action),
+        draw_two_heads(world_model.num_values, slices.action.device),
+        loss.discount,
+    )
+    metrics = {"value_target": target}
+    if slices.weights is not None:
+        metrics[PRIORITY] = action_td_error(world_model, rollout, slices, target)
+    return action_value_error(world_model, rollout, slices, target, dropout=loss.training), metrics
