@@ -128,7 +128,7 @@ def test_a_row_counts_the_planned_decisions_whose_plan_fell_back(tmp_path, tiny_
         for number in plans:
             broken[0] = number
             learner.step(updates=True)
-        said = pytest.warns(UserWarning, match="^no plan since the last row of train.csv had finite scores, so the pol")
+        said = pytest.warns(UserWarning, match="^no plan since the last row had finite scores, so the pol")
         with said if plans == [2] else contextlib.nullcontext():
             shares.append(learner.pop_row()["plan_fallbacks"])
     assert shares == [3 / 8, 1, 0]

@@ -139,7 +139,7 @@ class Learner:
         row |= {"episode_return": math.nan} | self._decisions.means()
         if row.get("plan_fallbacks") == 1:
             warnings.warn(
-                "no plan since the last row of train.csv had finite scores, so the policy acted instead; a lower "
+                "no plan since the last row had finite scores, so the policy acted instead; a lower "
                 "planner.beta, optim.lr or optim.grad_clip_norm may help.",
                 stacklevel=2,
             )
