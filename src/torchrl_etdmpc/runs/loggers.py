@@ -58,6 +58,7 @@ def make_logger(name: LoggerName, directory: RunDirectory, config: Mapping[str, 
         folder = directory.tensorboard
         return get_logger("tensorboard", logger_name=str(folder.parent), experiment_name=folder.name)
     import wandb  # pyright: ignore[reportMissingImports]  # an extra
+    from wandb.errors import Error as WandbError  # pyright: ignore[reportMissingImports]
 
     if not directory.wandb_id.exists():
         write_whole(directory.wandb_id, secrets.token_hex(4))
@@ -77,7 +78,7 @@ def make_logger(name: LoggerName, directory: RunDirectory, config: Mapping[str, 
 
     try:
         return start()
-    except wandb.errors.Error as error:
+    except WandbError as error:
         if options.get("mode") == "offline":
             raise
         warnings.warn(
