@@ -39,8 +39,8 @@ def run_command(monkeypatch, capsys):
 
 def test_the_wheel_s_command_is_the_examples_code():
     assert PROJECT["project"]["scripts"] == {"torchrl-etdmpc": "torchrl_etdmpc.commands:main"}
-    for script in (ROOT / "examples").glob("*.py"):
-        assert f'main("{script.stem}")' in script.read_text(encoding="utf-8")
+    for name in ("train", "train_dmc", "evaluate", "export", "report"):
+        assert f'main("{name}")' in (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
 
 
 def test_the_wheel_holds_every_file_that_the_package_reads():
