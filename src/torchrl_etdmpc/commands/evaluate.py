@@ -11,11 +11,12 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
-from torchrl_etdmpc.training import TrainConfig, hydra_main, load_agent, read_agent_file, resolve_device
+from torchrl_etdmpc.training import TrainConfig, load_agent, read_agent_file, resolve_device
 
 GIF_SIZE = 200  # pixels, for a page
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import torch
 
+from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.planners import export_planner, export_policy
 from torchrl_etdmpc.runs import replacing
-from torchrl_etdmpc.training import hydra_main, load_agent
+from torchrl_etdmpc.training import load_agent
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from torchrl_etdmpc.commands.command_line import as_typed, explicit_settings, hydra_main
 from torchrl_etdmpc.training import (
     EXIT_CODE,
     RunInterrupted,
     TrainConfig,
-    as_typed,
-    explicit_settings,
-    hydra_main,
     launch,
     with_stored_settings,
 )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG, train
 from torchrl_etdmpc.envs import DMC_TASKS
-from torchrl_etdmpc.training import TrainConfig, hydra_main, with_stored_settings
+from torchrl_etdmpc.training import TrainConfig, with_stored_settings
 
 
 @hydra_main(CONFIG, "train", complete=with_stored_settings)

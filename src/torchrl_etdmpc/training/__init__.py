@@ -10,8 +10,7 @@ from torchrl_etdmpc.training.builders import (
     resolve_device,
     row_bytes,
 )
-from torchrl_etdmpc.training.command_line import as_typed, explicit_settings, hydra_main, one_line_errors
-from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig, config_from_dict
 from torchrl_etdmpc.training.estimate import estimated_seconds, what_it_takes
 from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
 from torchrl_etdmpc.training.launch import (
@@ -23,6 +22,7 @@ from torchrl_etdmpc.training.launch import (
     with_stored_settings,
 )
 from torchrl_etdmpc.training.learner import Learner
+from torchrl_etdmpc.training.own_code import follow_own_code
 from torchrl_etdmpc.training.presets import PRESETS, preset
 from torchrl_etdmpc.training.signals import EXIT_CODE, RunInterrupted
 from torchrl_etdmpc.training.stepper import UpdateStepper
@@ -30,6 +30,9 @@ from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
 
 __all__ = [
+    "TASK_SETTINGS",
+    "config_from_dict",
+    "follow_own_code",
     "EXIT_CODE",
     "PRESETS",
     "Agent",
@@ -45,7 +48,6 @@ __all__ = [
     "TrainingRun",
     "UpdateStepper",
     "Updater",
-    "as_typed",
     "build_agent",
     "build_collector",
     "build_planner",
@@ -53,11 +55,8 @@ __all__ = [
     "build_replay",
     "build_world_model",
     "estimated_seconds",
-    "explicit_settings",
-    "hydra_main",
     "launch",
     "load_agent",
-    "one_line_errors",
     "plan_launch",
     "preset",
     "read_agent_file",

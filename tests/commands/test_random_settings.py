@@ -10,8 +10,8 @@ import torch
 
 pytest.importorskip("dm_control")
 
+from torchrl_etdmpc.commands.settings_help import settings_of  # noqa: E402
 from torchrl_etdmpc.training import TrainConfig, build_agent, build_reanalyze, build_replay, memory  # noqa: E402
-from torchrl_etdmpc.training.settings_help import settings_of  # noqa: E402
 
 BASE = {
     "task": "walker-walk",

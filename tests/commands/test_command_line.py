@@ -8,8 +8,9 @@ import pytest
 
 pytest.importorskip("hydra")
 
+from torchrl_etdmpc.commands.command_line import as_typed, hydra_main  # noqa: E402
 from torchrl_etdmpc.commands.train import CONFIG  # noqa: E402
-from torchrl_etdmpc.training import TrainConfig, as_typed, hydra_main  # noqa: E402
+from torchrl_etdmpc.training import TrainConfig  # noqa: E402
 
 
 @pytest.fixture

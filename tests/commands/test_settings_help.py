@@ -4,8 +4,8 @@ import pytest
 
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig
 from torchrl_etdmpc.commands.export import ExportConfig
+from torchrl_etdmpc.commands.settings_help import groups_of, help_text, settings_of
 from torchrl_etdmpc.training import TrainConfig, preset
-from torchrl_etdmpc.training.settings_help import groups_of, help_text, settings_of
 
 
 @pytest.mark.parametrize("config_class", [TrainConfig, EvaluateConfig, ExportConfig])

@@ -12,12 +12,10 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from torchrl_etdmpc.commands.settings_help import Setting, groups_of, help_text, settings_of
 from torchrl_etdmpc.envs import import_task, list_tasks
 from torchrl_etdmpc.runs import console, first_line
-from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig, config_from_dict
-from torchrl_etdmpc.training.own_code import follow_own_code
-from torchrl_etdmpc.training.presets import PRESETS, preset
-from torchrl_etdmpc.training.settings_help import Setting, groups_of, help_text, settings_of
+from torchrl_etdmpc.training import PRESETS, TASK_SETTINGS, TrainConfig, config_from_dict, follow_own_code, preset
 
 
 def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
