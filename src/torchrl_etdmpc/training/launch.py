@@ -110,7 +110,7 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         except SystemExit:
             if not stop.requested:
                 raise
-            state = "with nothing to save" if plan.action == "begin" else f"{plan.directory} is as it was"
+            state = "with nothing to save" if plan.action == "begin" else f"{plan.directory} goes on from where it was"
             raise RunInterrupted(f"stopped before the first step, {state}; start it again.") from None
     return (
         f"{plan.config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
