@@ -237,7 +237,7 @@ def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
     def restored(**changes: Any) -> Any:
         run.config = plan_launch(dataclasses.replace(config, **changes), changes).config
         run.learner.replay.empty()
-        run.resume()
+        run.checkpoints.restore()
         return run.config.to_dict(), state(run)
 
     expected = [restored()]

@@ -163,7 +163,7 @@ def test_a_new_content_of_the_checkpoint(tmp_path):
     resumed = tiny_run(tmp_path / "run", resume=True)
     diary = with_diary(resumed)
     with pytest.warns(UserWarning, match="fresh episodes begin"):  # this simulator has no state of its own
-        resumed.resume()
+        resumed.checkpoints.restore()
     assert diary.rewards == expected.rewards[:30]  # the last checkpoint; the rest is done again
     resumed.run()
     assert len(diary.rewards) == 40
@@ -172,12 +172,12 @@ def test_a_new_content_of_the_checkpoint(tmp_path):
 def test_a_checkpoint_without_the_new_content_says_so(tmp_path):
     run = tiny_run(tmp_path / "run")
     run.learner.step()
-    run.save()
+    run.checkpoints.save()
     run.log.directory.close()
     resumed = tiny_run(tmp_path / "run", resume=True)
     with_diary(resumed)
     with pytest.raises(RuntimeError, match=r"^cannot resume: .* lacks diary\.$"):
-        resumed.resume()
+        resumed.checkpoints.restore()
 
 
 # A new score: a function of the return table.

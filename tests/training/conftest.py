@@ -56,7 +56,7 @@ def _make_run(config: TrainConfig, run_dir: Path, *transforms: Transform, resume
     run = TrainingRun(config, env=env, eval_env=make(config.eval_episodes, 1), log=log)
     if resume:
         directory.go_on()
-        run.resume()
+        run.checkpoints.restore()
         directory.write_config(config.to_dict())
     else:
         directory.begin(config.to_dict())

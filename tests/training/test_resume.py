@@ -111,7 +111,7 @@ PLACES = {
     "in a decision in mid-episode": (lambda run: (run.learner.collector, "act"), 33),
     "at the end of an episode": (lambda run: (run.learner.collector, "act"), 40),
     "in a later evaluation": (lambda run: (run.evaluator.env, "step_and_maybe_reset"), 30),
-    "while it is saved": (lambda run: (run.store, "save"), 1),
+    "while it is saved": (lambda run: (run.checkpoints.store, "save"), 1),
 }
 
 
@@ -281,14 +281,14 @@ def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, mak
         "wall_s": 3.0,
     }
     run.state.load_state_dict(state)
-    assert run.save()
+    assert run.checkpoints.save()
     run.log.directory.close()
     resumed = make_run(config, tmp_path, resume=True)
     restored = resumed.state.state_dict()
     assert restored.pop("wall_s") >= state.pop("wall_s")
     assert restored == state
-    done, save = [], resumed.store.save
-    resumed.store.save = lambda step, *args, **options: done.append(step) or save(step, *args, **options)
+    done, save = [], resumed.checkpoints.store.save
+    resumed.checkpoints.store.save = lambda step, *args, **options: done.append(step) or save(step, *args, **options)
     stop_at(resumed, resumed.learner.collector, "act", 1)
     with pytest.raises(RunInterrupted):
         resumed.run()
@@ -306,7 +306,7 @@ def test_a_run_goes_on_in_the_stage_that_was_saved(tmp_path, stage, small_config
     for _ in range(30 if stage == "learn" else 24):
         run.learner.step()
     run.state.load_state_dict(run.state.state_dict() | {"stage": stage, "due": []})
-    assert run.save()
+    assert run.checkpoints.save()
     run.log.directory.close()
     resumed = make_run(config, tmp_path, resume=True)
     resumed.run()
@@ -318,7 +318,7 @@ def test_an_evaluation_after_a_resume_plays_the_same_episodes(tmp_path, small_co
     run = make_run(small_config(), tmp_path)
     for _ in range(5):
         run.learner.step()
-    assert run.save()
+    assert run.checkpoints.save()
     before = run.evaluator()
     run.log.directory.close()
     resumed = make_run(small_config(), tmp_path, resume=True)
@@ -351,10 +351,10 @@ def test_a_save_that_failed_half_way_leaves_nothing_out_of_the_next_one(tmp_path
             run.learner.step()
         part.refuses = not save
         if save:
-            assert run.save()
+            assert run.checkpoints.save()
         else:
             with pytest.warns(UserWarning, match=r"no checkpoint at 32 env steps \(No space left on device\)"):
-                assert not run.save()
+                assert not run.checkpoints.save()
     run.log.directory.close()
     resumed = make_run(small_config(), tmp_path, resume=True)  # in which any warning is an error
     assert resumed.env_steps == 48
@@ -554,7 +554,7 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     run = make_run(config, tmp_path)
     for _ in range(30):
         run.learner.step()
-    run.save()
+    run.checkpoints.save()
     for _ in range(10):
         run.learner.step()
     outcomes, other = [], make_run(config, tmp_path / "other")  # takes every state in turn
@@ -570,7 +570,7 @@ def test_a_process_that_is_killed_at_any_moment_of_a_save_leaves_a_checkpoint_th
     assert outcomes[-1] == (False, 80)
     assert {steps for _, steps in outcomes} == {60, 80}
     assert sorted(steps for _, steps in outcomes) == [steps for _, steps in outcomes]
-    run.save()  # and what the killed ones left behind goes
+    run.checkpoints.save()  # and what the killed ones left behind goes
     checkpoints = tmp_path / "checkpoints"
     kept = [json.loads(file.read_text())["replay"] for file in checkpoints.glob("resume/*/manifest.json")]
     named = {entry["file"] for files in kept for part in ("rows", "targets") for entry in files[part]}
@@ -583,7 +583,7 @@ def test_saving_the_same_step_again_never_leaves_it_without_a_checkpoint(tmp_pat
     run = make_run(config, tmp_path)
     for _ in range(30):
         run.learner.step()
-    run.save()
+    run.checkpoints.save()
     for moment in count(1):
         killed = killed_while_saving(run, moment)
         store = CheckpointStore(tmp_path / "checkpoints")
@@ -601,7 +601,7 @@ def killed_while_saving(run: TrainingRun, moment: int) -> bool:
         child = os.fork()
     if child == 0:
         die_at(moment)
-        run.save()
+        run.checkpoints.save()
         os._exit(0)
     return os.WIFSIGNALED(os.waitpid(child, 0)[1])
 

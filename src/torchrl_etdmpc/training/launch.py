@@ -140,7 +140,7 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
         try:
             log.logger = make_logger(config.logger, directory, config.to_dict())
             if plan.action == "resume":
-                run.resume()  # before anything of the run is changed: it may not be possible
+                run.checkpoints.restore()  # before anything of the run is changed: it may not be possible
             directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
             directory.write_config(config.to_dict())
             what = f"{config.task} with preset {config.preset}"

@@ -6,7 +6,6 @@ import math
 import shutil
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 
-from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, DamagedBufferError, Part
+from torchrl_etdmpc.checkpoints import Part
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
 from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent
@@ -22,6 +21,7 @@ from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.evaluator import Evaluator
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.precompile import precompile
+from torchrl_etdmpc.training.run_checkpoints import RunCheckpoints
 from torchrl_etdmpc.training.run_state import Duty, RunState
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 
@@ -62,7 +62,6 @@ class TrainingRun:
             seed=(config.seed + 10_000) % 2**32,  # other episodes than those of training
             with_policy=config.eval_policy,
         )
-        self.store = CheckpointStore(log.directory.checkpoints, keep=config.checkpoint_keep)
         self.state = RunState()
         self.stop = StopSignals() if stop is None else stop
         file = AgentFile(agent, config, self.counters)
@@ -78,7 +77,8 @@ class TrainingRun:
             "state": self.state,
             "random": GlobalRNGState(),  # last: restoring the others may draw from it
         }
-        self._compile_s, self._saved_at, self._saved_step = 0.0, time.perf_counter(), -1
+        self.checkpoints = RunCheckpoints(config, log.directory, self.learner, self.best, self.parts)
+        self._compile_s = 0.0
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
 
     @property
@@ -94,39 +94,6 @@ class TrainingRun:
             "updates": self.learner.agent.updater.updates,
             "wall_time_s": round(self.state.wall_time_s, 2),
         }
-
-    def resume(self) -> None:
-        """Goes on from the newest checkpoint in the run directory, exactly as if nothing had happened.
-
-        With ``resume=weights``, where no checkpoint is whole: from the newest weights and what is left of the buffer,
-        in a fresh episode.
-
-        Raises:
-            CheckpointError: if there is none to go on from.
-        """
-        try:
-            folder = self.store.load(self.parts, self.learner.replay)
-        except DamagedBufferError as error:
-            if self.config.resume != "weights":
-                raise CheckpointError(
-                    f"{error} resume=weights goes on with the weights and what is left of the buffer."
-                ) from error
-            folder = self._salvage()
-        self._saved_step = self.env_steps
-        torchrl_logger.info(f"going on from {folder} ({self.env_steps} env steps)")
-
-    def _salvage(self) -> Path:
-        replay, collector = self.learner.replay, self.learner.collector
-        parts = {name: part for name, part in self.parts.items() if name != "sampler"}  # it follows the new rows
-        folder = self.store.salvage(parts, replay)
-        least = min(self.config.seed_decisions, collector.frames)
-        if len(replay) < least:
-            raise CheckpointError(
-                f"cannot resume: {len(replay)} rows of the buffer are left, fewer than the {least} that learning "
-                "begins with; start a new run."
-            )
-        collector.set_seed((self.config.seed + collector.frames) % 2**32)  # the buffer may end in another episode
-        return folder
 
     def run(self) -> dict[str, Any]:
         """Trains to the budget, draws the curve and writes the summary.
@@ -147,26 +114,22 @@ class TrainingRun:
             self._pretrain()
             self._learn()
         except (NonFiniteError, SimulatorError):
-            self.save()
+            self.checkpoints.save()
             raise
         finally:
             self.learner.collector.shutdown(raise_on_error=False)
             self.evaluator.close()
         summary = self.summary()
         _draw_curve(self.log.directory)
-        self._finish(summary)
-        return summary
-
-    def _finish(self, summary: dict[str, Any]) -> None:
         try:
-            if self._saved_step != self.env_steps:
-                self._write_checkpoint()
+            self.checkpoints.save_end()
             self.log.finish(summary)
         except OSError as error:
             raise OSError(
                 f"run_dir={self.log.directory} made its {self.env_steps} env steps, but the end could not be saved "
                 f"({error.strerror}), so it is not finished; make room and go on with resume=auto."
             ) from error
+        return summary
 
     def precompile(self) -> None:
         """Compiles what the run will call; see :func:`~torchrl_etdmpc.training.precompile.precompile`."""
@@ -229,9 +192,8 @@ class TrainingRun:
 
     def _after_work(self) -> None:
         """Does what is due, and stops here if that was asked for."""
-        minutes, due = self.config.checkpoint_minutes, self.state.due
-        if minutes is not None and "checkpoint" not in due and time.perf_counter() - self._saved_at > 60 * minutes:
-            due.append("checkpoint")
+        if self.checkpoints.overdue and "checkpoint" not in self.state.due:
+            self.state.due.append("checkpoint")
         self._do_what_is_due()
 
     def _do_what_is_due(self) -> None:
@@ -240,7 +202,7 @@ class TrainingRun:
             self._stop_if_asked()
             if due[0] == "checkpoint":
                 due.pop(0)  # a run that goes on from this checkpoint need not save it again
-                self.save()
+                self.checkpoints.save()
             else:
                 {"evaluation": self.evaluate, "train_row": self.write_row}[due[0]]()
                 due.pop(0)
@@ -250,7 +212,7 @@ class TrainingRun:
         if self.stop.requested:
             if not self.env_steps:
                 raise RunInterrupted("stopped before the first step, with nothing to save; start it again.")
-            saved = "saved" if self.save() else "not saved: the checkpoint before it stays"
+            saved = "saved" if self.checkpoints.save() else "not saved: the checkpoint before it stays"
             raise RunInterrupted(
                 f"stopped at {self.env_steps} env steps and {saved} in {self.log.directory}; go on with resume=true."
             )
@@ -287,28 +249,6 @@ class TrainingRun:
     def write_row(self) -> None:
         """Appends a row to ``train.csv``: means over the interval, and counts since the run began."""
         self.log.log_train(self.learner.pop_row(), **self.counters())
-
-    def save(self) -> bool:
-        """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time.
-
-        Returns:
-            bool: whether it was written.
-        """
-        try:
-            self._write_checkpoint()
-        except OSError as error:
-            reason = error.strerror or str(error)
-            warnings.warn(f"no checkpoint at {self.env_steps} env steps ({reason}); training goes on.", stacklevel=2)
-            return False
-        return True
-
-    def _write_checkpoint(self) -> None:
-        self._saved_at = time.perf_counter()
-        self.best.write()
-        version = int(self.learner.agent.world_model.version)
-        links = {self.log.directory.last_agent: "agent"}
-        self.store.save(self.env_steps, self.parts, self.learner.replay, version=version, links=links)
-        self._saved_step = self.env_steps
 
     def summary(self) -> dict[str, Any]:
         """What the run came to."""

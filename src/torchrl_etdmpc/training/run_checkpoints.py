@@ -1,0 +1,111 @@
+"""Saving a run, and going on with one that was saved."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+from torchrl import torchrl_logger
+
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, DamagedBufferError, Part
+from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.training.agent_file import BestAgent
+from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.learner import Learner
+
+
+class RunCheckpoints:
+    """The checkpoints of one run: its parts and its buffer, written when asked and restored.
+
+    Args:
+        config (TrainConfig): how often, how many, and what may be gone on with.
+        directory (RunDirectory): of the run.
+        learner (Learner): has the buffer, the version of the weights and the counts.
+        best (BestAgent): its file is written here if the disk did not take it before.
+        parts (mapping): what is saved and restored, in this order.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        directory: RunDirectory,
+        learner: Learner,
+        best: BestAgent,
+        parts: Mapping[str, Part],
+    ) -> None:
+        self.config, self.learner, self.best, self.parts = config, learner, best, parts
+        self.store = CheckpointStore(directory.checkpoints, keep=config.checkpoint_keep)
+        self._links = {directory.last_agent: "agent"}
+        self._saved_at, self._saved_step = time.perf_counter(), -1
+
+    @property
+    def overdue(self) -> bool:
+        """Whether more than ``checkpoint_minutes`` have passed since the last one."""
+        minutes = self.config.checkpoint_minutes
+        return minutes is not None and time.perf_counter() - self._saved_at > 60 * minutes
+
+    def save(self) -> bool:
+        """Writes a checkpoint; one that cannot be written is a warning, and the next one is tried in its time.
+
+        Returns:
+            bool: whether it was written.
+        """
+        try:
+            self._write()
+        except OSError as error:
+            reason, steps = error.strerror or str(error), self.learner.env_steps
+            warnings.warn(f"no checkpoint at {steps} env steps ({reason}); training goes on.", stacklevel=2)
+            return False
+        return True
+
+    def save_end(self) -> None:
+        """Writes a checkpoint unless the newest one is of this step.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        if self._saved_step != self.learner.env_steps:
+            self._write()
+
+    def _write(self) -> None:
+        self._saved_at = time.perf_counter()
+        self.best.write()
+        learner = self.learner
+        version = int(learner.agent.world_model.version)
+        self.store.save(learner.env_steps, self.parts, learner.replay, version=version, links=self._links)
+        self._saved_step = learner.env_steps
+
+    def restore(self) -> None:
+        """Goes on from the newest checkpoint, exactly as if nothing had happened.
+
+        With ``resume=weights``, where no checkpoint is whole: from the newest weights and what is left of the buffer,
+        in a fresh episode.
+
+        Raises:
+            CheckpointError: if there is none to go on from.
+        """
+        try:
+            folder = self.store.load(self.parts, self.learner.replay)
+        except DamagedBufferError as error:
+            if self.config.resume != "weights":
+                raise CheckpointError(
+                    f"{error} resume=weights goes on with the weights and what is left of the buffer."
+                ) from error
+            folder = self._salvage()
+        self._saved_step = self.learner.env_steps
+        torchrl_logger.info(f"going on from {folder} ({self._saved_step} env steps)")
+
+    def _salvage(self) -> Path:
+        replay, collector = self.learner.replay, self.learner.collector
+        parts = {name: part for name, part in self.parts.items() if name != "sampler"}  # it follows the new rows
+        folder = self.store.salvage(parts, replay)
+        least = min(self.config.seed_decisions, collector.frames)
+        if len(replay) < least:
+            raise CheckpointError(
+                f"cannot resume: {len(replay)} rows of the buffer are left, fewer than the {least} that learning "
+                "begins with; start a new run."
+            )
+        collector.set_seed((self.config.seed + collector.frames) % 2**32)  # the buffer may end in another episode
+        return folder
