@@ -1,13 +1,15 @@
-"""Kills, signals and flipped bits: a run ends as if nothing had happened, or says in one line what is wrong.
+"""Kills, signals, flipped bits, settings: a run ends as if nothing had happened, or says in a line what is wrong.
 
     python benchmarks/faults.py kills --number 300   # real processes, stopped at random moments from their imports on
     python benchmarks/faults.py flips --number 20000 # in any file of a run that is gone on with
+    python benchmarks/faults.py settings --number 2000
 
 *kills*: small runs with one environment, three environments, and compilation, each started with `resume=auto` until it
 has finished, and stopped by SIGKILL, SIGTERM, SIGINT or SIGUSR1 at random moments. Nothing may print a traceback, hang,
 or end with an unknown code; at the end curves, weights, best weights and buffer must be those of a run left alone.
 *flips*: one bit anywhere in the directory of a run; what is restored must be the newest checkpoint or an older one, to
-the last bit, or an error in one line. Both write `benchmarks/results/cpu/faults/<name>.json`. POSIX only.
+the last bit, or an error in one line. *settings*: values that make no sense, drawn as in
+`tests/commands/test_random_settings.py`. All write `benchmarks/results/cpu/faults/<name>.json`. POSIX only.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import argparse
 import contextlib
 import csv
 import dataclasses
+import importlib.util
 import json
 import os
 import random
@@ -235,7 +238,7 @@ def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
     run = make_run(config, run_dir)
 
     def restored(**changes: Any) -> Any:
-        run.config = plan_launch(dataclasses.replace(config, **changes), changes).config
+        run.config = run.checkpoints.config = plan_launch(dataclasses.replace(config, **changes), changes).config
         run.learner.replay.empty()
         run.checkpoints.restore()
         return run.config.to_dict(), state(run)
@@ -284,16 +287,33 @@ def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
     return {"flips": number, "outcomes": found, "by_file": by_file, "complaints": complaints}
 
 
+# -- settings ---------------------------------------------------------------------------------------------------------
+
+
+def settings(number: int, seed: int, folder: Path) -> dict[str, Any]:
+    file = ROOT / "tests" / "commands" / "test_random_settings.py"
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    found, complaints = Counter(), Complaints()
+    for drawn in range(seed * 1_000_000, seed * 1_000_000 + number):  # others than the test's
+        try:
+            found[module.judge(drawn)] += 1
+        except Exception as error:
+            complaints.append(f"drawn with seed {drawn}: {type(error).__name__}: {error}")
+    return {"settings": number, "outcomes": found, "complaints": complaints}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=["kills", "flips"])
+    parser.add_argument("what", choices=["kills", "flips", "settings"])
     parser.add_argument("--number", type=int)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=RESULTS / "faults")
     arguments = parser.parse_args()
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
-    number = arguments.number or {"kills": 300, "flips": 20_000}[arguments.what]
+    number = arguments.number or {"kills": 300, "flips": 20_000, "settings": 2_000}[arguments.what]
     tick = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         answer = {"seed": arguments.seed} | globals()[arguments.what](number, arguments.seed, Path(folder))
