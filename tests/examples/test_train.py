@@ -163,7 +163,10 @@ REFUSED = [
     ("task=gym/CartPole-v1", "gym/CartPole-v1 has discrete actions (Discrete); only continuous actions are supported."),
     ("task=gym/Blackjack-v1", "Gymnasium sets no time limit for Blackjack-v1; give one in env steps: task.episode_"),
     ("task=gym/Pendulum-v1 task.action_repeat=0", "task.action_repeat of task 'gym/Pendulum-v1' must be at least 1"),
-    ("task=gym/Pendulum-v1 task.episode_length=2", "loss.slice_len must fit into an episode of 2 decisions, got 3."),
+    (
+        "task=gym/Pendulum-v1 task.episode_length=2",
+        "loss.slice_len must fit into an episode of 2 decisions (task.episode_length=2, task.action_repeat=1), got 3.",
+    ),
     ("task=nowhere:make", "task 'nowhere:make': there is no module 'nowhere' on Python's path or in "),
     ("task=mymodule:nothing", "task 'mymodule:nothing': the module 'mymodule' ("),
     ("task=mymodule:", "task 'mymodule:' must read package.module:attribute."),

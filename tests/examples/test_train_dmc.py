@@ -212,7 +212,10 @@ REFUSED = [
     ("model.activation=tanh", "model.activation must be one of mish, silu, relu, got 'tanh'."),
     ("loss.rho=2", "loss.rho must be in (0, 1], got 2.0."),
     ("loss.slice_len=0", "loss.slice_len must be at least 1, got 0."),
-    ("loss.slice_len=1000", "loss.slice_len must fit into an episode of 500 decisions, got 1000."),
+    (
+        "loss.slice_len=1000",
+        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), got 1000.",
+    ),
     ("optim.lr=0", "optim.lr must be positive, got 0.0."),
     ("total_env_steps=5000", "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise "),
     ("replay.capacity=2", "replay.capacity must be at least 6 with these settings, got 2."),

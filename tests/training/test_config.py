@@ -345,7 +345,10 @@ REFUSED_AT_ONCE = [
     ({"replay__seed_decisions": -1}, "replay.seed_decisions must not be negative, got -1."),
     ({"eval_episodes": 20_000}, "eval_episodes must be at most 10000, got 20000."),
     ({"action_repeat": 1001}, "action_repeat of task 'walker-walk' must be at most episode_length=1000, got 1001."),
-    ({"loss__slice_len": 501}, "loss.slice_len must fit into an episode of 500 decisions, got 501."),
+    (
+        {"loss__slice_len": 501},
+        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), got 501.",
+    ),
     ({"loss__kl_direction": "both"}, "loss.kl_direction must be one of backward, forward, got 'both'."),
     ({"optim__lr": float("nan")}, "optim.lr must be a finite number below 1e30, got nan."),
     ({"model__latent_dim": 1e16}, "model.latent_dim must be a whole number below 2**53, got 1e+16."),

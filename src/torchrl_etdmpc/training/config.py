@@ -259,7 +259,9 @@ class TrainConfig:
     def _check_against_the_episode(self, task: Task) -> None:
         episode, slice_len = task.decision_steps_per_episode, self.loss.slice_len
         _require(
-            slice_len <= episode, f"loss.slice_len must fit into an episode of {episode} decisions, got {slice_len}."
+            slice_len <= episode,
+            f"loss.slice_len must fit into an episode of {episode} decisions (task.episode_length="
+            f"{task.episode_length}, task.action_repeat={task.action_repeat}), got {slice_len}.",
         )
         per_episode = episode * self.num_envs if self.replay.insertion == "episode" else 0
         # Fewer rows may hold nothing but the end of one episode and the beginning of the next.
