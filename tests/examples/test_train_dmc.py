@@ -214,7 +214,8 @@ REFUSED = [
     ("loss.slice_len=0", "loss.slice_len must be at least 1, got 0."),
     (
         "loss.slice_len=1000",
-        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), got 1000.",
+        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), "
+        "got 1000.",
     ),
     ("optim.lr=0", "optim.lr must be positive, got 0.0."),
     ("total_env_steps=5000", "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise "),

@@ -347,7 +347,8 @@ REFUSED_AT_ONCE = [
     ({"action_repeat": 1001}, "action_repeat of task 'walker-walk' must be at most episode_length=1000, got 1001."),
     (
         {"loss__slice_len": 501},
-        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), got 501.",
+        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), "
+        "got 501.",
     ),
     ({"loss__kl_direction": "both"}, "loss.kl_direction must be one of backward, forward, got 'both'."),
     ({"optim__lr": float("nan")}, "optim.lr must be a finite number below 1e30, got nan."),
