@@ -47,7 +47,10 @@ _FLOORS = (
         },
     },
     {
-        "commands": {"analysis", "collectors", "envs", "planners", "runs", "training"},
+        "suites": {"analysis", "envs", "runs", "training"},
+    },
+    {
+        "commands": {"analysis", "collectors", "envs", "planners", "runs", "suites", "training"},
     },
 )
 _MAY_IMPORT = {name: allowed for floor in _FLOORS for name, allowed in floor.items()}
@@ -190,8 +193,8 @@ def test_functional_imports_nothing_but_torch():
 
 
 def test_extras_are_imported_only_where_they_are_used():
-    # The reports need their extras throughout, and only the commands import them.
-    for path in sorted(set(_PACKAGE.rglob("*.py")) - set(_files("analysis"))):
+    # The reports and the suites need their extras throughout, and only the commands import them.
+    for path in sorted(set(_PACKAGE.rglob("*.py")) - set(_files("analysis")) - set(_files("suites"))):
         roots = {name.split(".")[0] for name in _imports_of(path, outside_functions=True)}
         wrong = roots - _CORE - {"torchrl_etdmpc"} - set(sys.stdlib_module_names)
         assert not wrong, f"{path.relative_to(_ROOT)} imports {', '.join(sorted(wrong))} outside of a function"
@@ -206,7 +209,7 @@ def test_importing_the_package_loads_no_extra():
         "import torchrl_etdmpc.testing, torchrl_etdmpc.training\n"
         f"extras = set({_EXTRAS!r})\n"
         "print(*sorted(extras & (set(sys.modules) - before)))\n"
-        "loaded_by_torch = {'mujoco', 'tqdm'}  # and TorchRL, where they are there\n"
+        "loaded_by_torch = {'mujoco', 'tqdm', 'yaml'}  # and TorchRL; the last by Ray, where it is there\n"
         "print(*sorted(extras & set(sys.modules) - loaded_by_torch))\n"
     )
     environment = os.environ | {"PYTHONPATH": str(_ROOT / "src"), "MUJOCO_GL": "disable"}
@@ -235,6 +238,8 @@ def test_the_pins_satisfy_the_declared_ranges_of_everything_that_the_commands_ne
         *extras["test"],
         *extras["tensorboard"],
         *extras["wandb"],
+        *extras["ray"],
+        *extras["sweep"],
     ]
     pins = _pins()
     for requirement in map(Requirement, declared):

@@ -66,6 +66,7 @@ def test_the_names_of_the_files_are_those_that_other_programs_read():
         "best_agent": "runs/walker/checkpoints/best.pt",
         "tensorboard": "runs/walker/tensorboard",
         "wandb_id": "runs/walker/wandb_id",
+        "lock": "runs/walker/.lock",
     }
     assert str(directory) == f"{directory}" == "runs/walker"
 

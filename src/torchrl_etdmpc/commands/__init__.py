@@ -1,4 +1,4 @@
-"""The commands ``torchrl-etdmpc train|evaluate|export|report``; the scripts in ``examples/`` run the same ones."""
+"""The commands ``torchrl-etdmpc train|evaluate|export|report|suite``; the scripts in ``examples/`` run the same."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ _COMMANDS = {
     "evaluate": "plays episodes with a trained agent, and films them",
     "export": "writes an agent as programs that need PyTorch only",
     "report": "compares runs with each other and with published baselines",
+    "suite": "trains every run of an experiment: tasks x seeds x variants",
 }
 
 
@@ -26,8 +27,8 @@ def main(command: str | None = None) -> None:
     looks for a renderer when it is imported, is told whether there will be anything to render.
 
     Args:
-        command (str, optional): ``"train"``, ``"train_dmc"``, ``"evaluate"``, ``"export"`` or ``"report"``. Default:
-            the first argument.
+        command (str, optional): ``"train"``, ``"train_dmc"``, ``"evaluate"``, ``"export"``, ``"report"``, ``"suite"``.
+            Default: the first argument.
     """
     if command is None:
         command = _first_argument()

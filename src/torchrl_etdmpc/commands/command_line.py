@@ -138,7 +138,7 @@ def _answer(arguments: list[str], config_class: type, what: str) -> str | None:
             topic = argument.lstrip("-").removesuffix(".*").rstrip(".")
             known = [*groups_of(config_class), *settings]
             if topic not in known:
-                raise ValueError(f"there is no group and no setting {topic!r}; {_nearest(topic, known)}")
+                raise ValueError(f"there is no group and no setting {topic!r}; {nearest(topic, known)}")
             topics.append(topic)
     return help_text(config_class, what, _command(), tuple(topics), values)
 
@@ -186,7 +186,7 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
                 f"{name} is a group of settings; --help {name} lists them, e.g. {_first(name, settings)}=..."
             )
         if name not in settings:
-            raise ValueError(f"unknown setting {name}; {_nearest(name, settings)}")
+            raise ValueError(f"unknown setting {name}; {nearest(name, settings)}")
         if argument.startswith("-") or not equals:
             raise ValueError(f"a setting is written name=value, without dashes or spaces, got {argument!r}.")
         if name == "preset":
@@ -227,7 +227,7 @@ def _first(group: str, settings: Iterable[str]) -> str:
     return next(name for name in settings if name.startswith(f"{group}."))
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
     """A hint at names like this one: the same last part in another group counts too."""
     known, last = list(known), name.rpartition(".")[2].lower()
     same = [other for other in known if other.rpartition(".")[2] == last]

@@ -8,6 +8,7 @@ import hashlib
 import os
 import shutil
 import stat
+import time
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,6 @@ from typing import Any
 
 from torchrl_etdmpc.runs.files import DamagedFileError, read_whole, write_whole
 
-_LOCK = ".lock"
 _CONFIG_BYTES = 2**20
 _SEAL = "# what this run trains with, as it was written: sha256 "
 
@@ -40,6 +40,7 @@ class RunDirectory:
         best_agent (Path): ``checkpoints/best.pt``, those with the best evaluation.
         tensorboard (Path): that logger's files.
         wandb_id (Path): by which the run is known there.
+        lock (Path): there while a process writes, and after one was killed.
 
     >>> RunDirectory("runs/walker").eval.name
     'eval.csv'
@@ -57,6 +58,7 @@ class RunDirectory:
         self.best_agent = self.checkpoints / "best.pt"
         self.tensorboard = self.path / "tensorboard"
         self.wandb_id = self.path / "wandb_id"
+        self.lock = self.path / ".lock"
         self._unlock: weakref.finalize | None = None
         self._made: list[Path] = []  # folders, the outermost first
 
@@ -82,6 +84,29 @@ class RunDirectory:
     def finished(self) -> bool:
         """Whether the run reached its budget."""
         return self.summary.is_file()
+
+    @property
+    def in_use(self) -> bool:
+        """Whether a process has locked it; always false without system locks.
+
+        To be asked by other processes only: a system lock of this process's own ends when the file is closed here.
+        """
+        if self._unlock is not None:
+            return True
+        try:
+            import fcntl
+
+            file = open(self.lock, "rb+")
+        except (ImportError, OSError):
+            return False
+        with file:
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except (BlockingIOError, PermissionError):
+                return True
+            except OSError:  # a file system without locks
+                return False
+        return False
 
     def read_config(self) -> Any:
         """The stored configuration as plain values.
@@ -214,7 +239,7 @@ class RunDirectory:
             for folder, folders, files in os.walk(top)  # which does not follow links
             for name in (*folders, *files)
         ]
-        for path in (*own, self.path / _LOCK, *inside):
+        for path in (*own, *inside):
             if os.path.lexists(path) and stat.S_IFMT(path.lstat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
                 raise OSError(
                     f"{path} is a link or a special file, through which a run would change something elsewhere; "
@@ -228,15 +253,19 @@ class RunDirectory:
             import fcntl
         except ImportError:  # Windows
             return
+        patience = time.monotonic() + 0.2
         while self._unlock is None:
             try:
-                descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+                descriptor = os.open(self.lock, os.O_RDWR | os.O_CREAT, 0o644)
             except OSError as error:
                 raise self._not_writable(error) from error
             try:  # unlike flock, lockf is not inherited by the environments' processes
                 fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except (BlockingIOError, PermissionError) as error:
                 os.close(descriptor)
+                if time.monotonic() < patience:  # somebody may just be asking whether it is in use
+                    time.sleep(0.05)
+                    continue
                 raise OSError(
                     f"run_dir={self} is in use by another process; wait for it or choose another run_dir."
                 ) from error
@@ -244,7 +273,7 @@ class RunDirectory:
                 os.close(descriptor)
                 return
             if os.fstat(descriptor).st_nlink:
-                self._unlock = weakref.finalize(self, _unlock, self.path / _LOCK, descriptor)
+                self._unlock = weakref.finalize(self, _unlock, self.lock, descriptor)
             else:  # its owner has unlocked and removed it since it was opened
                 os.close(descriptor)
 

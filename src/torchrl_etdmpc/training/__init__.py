@@ -14,6 +14,7 @@ from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig, config_fr
 from torchrl_etdmpc.training.estimate import estimated_seconds, what_it_takes
 from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
 from torchrl_etdmpc.training.launch import (
+    CHANGEABLE,
     Launch,
     launch,
     plan_launch,
@@ -30,6 +31,7 @@ from torchrl_etdmpc.training.train import TrainingRun
 from torchrl_etdmpc.training.updater import Updater
 
 __all__ = [
+    "CHANGEABLE",
     "TASK_SETTINGS",
     "config_from_dict",
     "follow_own_code",

@@ -1,0 +1,114 @@
+"""One run in a process of its own: its command, its output, and what its end means."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.suites.experiment import Run, flat
+from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, preset
+
+End = Literal["finished", "stopped", "elsewhere", "failed"]
+_FAILED = "suite: failed: "
+_TAIL_BYTES = 16_384
+
+
+def command(run: Run, **more: Any) -> list[str]:
+    """The command that trains a run from wherever it is; it names every setting that differs from the preset's.
+
+    Args:
+        run (Run): the run.
+        **more: settings that may change on the way, e.g. ``threads``.
+    """
+    config = run.config
+    usual = flat(preset(config.preset).to_dict())
+    values = {name: value for name, value in flat(config.to_dict()).items() if value != usual[name]}
+    values |= {"preset": config.preset, "task": run.task, "seed": run.seed, "total_env_steps": config.total_env_steps}
+    values |= {"run_dir": str(run.path), "resume": "auto"} | more
+    typed = {f"task.{name}" if name in TASK_SETTINGS else name: value for name, value in values.items()}
+    settings = [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in typed.items()]
+    return [sys.executable, "-m", "torchrl_etdmpc.commands", "train", *settings]
+
+
+def log_file(run: Run) -> Path:
+    """What the run's processes printed, one after the other."""
+    return run.path / "suite.log"
+
+
+def start(run: Run, *, threads: int | None = None, gpu: int | None = None) -> subprocess.Popen[bytes]:
+    """Starts the run's process, in a session of its own: Ctrl-C in the terminal is for the suite, which passes it on.
+
+    Args:
+        run (Run): the run; its directory is made.
+
+    Keyword Args:
+        threads (int, optional): for a run whose settings leave them open.
+        gpu (int, optional): the only one that it sees.
+
+    Raises:
+        OSError: if the directory cannot be written.
+    """
+    environment, more = dict(os.environ), {}
+    if threads is not None and run.config.threads is None:
+        more["threads"] = threads
+        environment["OMP_NUM_THREADS"] = str(threads)
+    if gpu is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = str(gpu)
+    run.path.mkdir(parents=True, exist_ok=True)
+    with open(log_file(run), "ab") as log:
+        log.write(b"suite: begun\n")
+        log.flush()
+        return subprocess.Popen(
+            command(run, **more),
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+
+def end(run: Run, code: int) -> End:
+    """What the end of a run's process means, by its exit code; notes a failure in the log.
+
+    A process that was stopped by a signal, or asked to stop, has not failed.
+    """
+    directory = RunDirectory(run.path)
+    if code == 0 and directory.finished:
+        return "finished"
+    last = _last_line(log_file(run))
+    if "is in use by another process" in last:
+        return "elsewhere"
+    if code in (EXIT_CODE, 130) or code < 0 or code - 128 in set(signal.Signals):
+        return "stopped"
+    note_failure(run, last.removeprefix("error: ") or f"exit code {code}")
+    return "failed"
+
+
+def note_failure(run: Run, reason: str) -> None:
+    """Writes into the run's log that it has failed, where :func:`last_failure` finds it."""
+    run.path.mkdir(parents=True, exist_ok=True)
+    with open(log_file(run), "a", encoding="utf-8") as log:
+        log.write(f"{_FAILED}{reason}\n")
+
+
+def last_failure(run: Run) -> str | None:
+    """Why the newest process of a run failed, if it did."""
+    last = _last_line(log_file(run))
+    return last.removeprefix(_FAILED) if last.startswith(_FAILED) else None
+
+
+def _last_line(file: Path) -> str:
+    try:
+        with open(file, "rb") as log:
+            log.seek(max(log.seek(0, os.SEEK_END) - _TAIL_BYTES, 0))
+            lines = log.read().decode(errors="replace").splitlines()
+    except OSError:
+        return ""
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")

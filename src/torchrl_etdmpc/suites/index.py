@@ -1,0 +1,181 @@
+"""Where every run of an experiment is: read from the run directories, kept in one file so that it costs little."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import math
+import os
+import sqlite3
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.suites.attempt import last_failure, log_file
+from torchrl_etdmpc.suites.experiment import Run
+
+State = Literal["finished", "running", "stopped", "failed", "waiting"]
+_TAIL_BYTES = 8192
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far one run is.
+
+    Args:
+        state (str): ``"finished"``; ``"running"``, in whatever process; ``"stopped"`` on its way; ``"failed"``;
+            ``"waiting"``, not begun.
+        env_steps (int): made so far.
+        latest_return (float): of its last evaluation; NaN before the first one.
+        decisions_per_second (float): lately; NaN if not known.
+        error (str): the last line of a failed run.
+    """
+
+    state: State
+    env_steps: int = 0
+    latest_return: float = math.nan
+    decisions_per_second: float = math.nan
+    error: str = ""
+
+
+def read_progress(run: Run) -> Progress:
+    """How far a run is, from its directory alone; a damaged file counts as missing."""
+    directory = RunDirectory(run.path)
+    evals, rows = _last_rows(directory.eval), _last_rows(directory.train)
+    latest = _number(evals[-1], "return_mean") if evals else math.nan
+    steps = max((int(_number(row, "env_steps", 0)) for row in (*evals[-1:], *rows[-1:])), default=0)
+    speed = _speed(rows)
+    if directory.finished:
+        summary = _summary(directory.summary)
+        steps = int(_number(summary, "env_steps", steps))
+        if steps >= run.config.total_env_steps:
+            return Progress("finished", steps, latest, _number(summary, "decisions_per_second", speed))
+    if directory.in_use:
+        return Progress("running", steps, latest, speed)
+    error = last_failure(run)
+    if error is not None:
+        return Progress("failed", steps, latest, speed, error)
+    return Progress("stopped" if directory.holds_a_run else "waiting", steps, latest, speed)
+
+
+class RunIndex:
+    """What :func:`read_progress` says of many runs; only those that changed are read again.
+
+    The file can be removed at any time. Where it cannot be used (a read-only folder, a damaged file), all is read from
+    the directories.
+
+    Args:
+        file (Path): an SQLite file.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def read(self, runs: Sequence[Run]) -> list[Progress]:
+        """The progress of every run, in their order."""
+        known = self._load()
+        answers, changed = [], []
+        for run in runs:
+            stamp = _stamp(run)
+            before = known.get(str(run.path))
+            if before is not None and before[0] == stamp and before[1].state != "running":
+                answers.append(before[1])
+                continue
+            answers.append(read_progress(run))
+            changed.append((str(run.path), run.variant, run.task, run.seed, stamp, *astuple(answers[-1])))
+        if changed:
+            self._store(changed)
+        return answers
+
+    def _load(self) -> dict[str, tuple[str, Progress]]:
+        try:
+            with contextlib.closing(sqlite3.connect(f"{self.file.absolute().as_uri()}?mode=ro", uri=True)) as database:
+                rows = database.execute(f"SELECT path, stamp, {', '.join(_COLUMNS)} FROM runs").fetchall()
+            return {path: (stamp, _progress(values)) for path, stamp, *values in rows}
+        except (sqlite3.Error, TypeError, ValueError):  # missing, damaged, of another version
+            return {}
+
+    def _store(self, rows: Iterable[tuple[Any, ...]]) -> None:
+        columns = ("path", "variant", "task", "seed", "stamp", *_COLUMNS)
+        for _ in range(2):
+            try:
+                with contextlib.closing(sqlite3.connect(self.file, timeout=10)) as database, database:
+                    database.execute(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(columns)}, PRIMARY KEY (path))")
+                    marks = ", ".join("?" * len(columns))
+                    database.executemany(f"INSERT OR REPLACE INTO runs ({', '.join(columns)}) VALUES ({marks})", rows)
+                return
+            except sqlite3.OperationalError as error:
+                if "has no column" not in str(error):  # the folder is read-only, or somebody else is writing
+                    return
+            except sqlite3.DatabaseError:
+                pass
+            with contextlib.suppress(OSError):  # it can be made anew from the directories
+                self.file.unlink()
+
+
+_COLUMNS = tuple(entry.name for entry in fields(Progress))
+
+
+def _progress(values: Sequence[Any]) -> Progress:
+    state, steps, latest, speed, error = values
+    return Progress(state, int(steps), _float(latest), _float(speed), str(error))
+
+
+def _stamp(run: Run) -> str:
+    """Changes when a file that :func:`read_progress` reads does, or the budget."""
+    directory = RunDirectory(run.path)
+    parts: list[str] = [str(run.config.total_env_steps)]
+    for file in (directory.summary, directory.eval, directory.train, directory.lock, log_file(run)):
+        try:
+            status = os.stat(file)
+            parts.append(f"{status.st_mtime_ns}:{status.st_size}")
+        except OSError:
+            parts.append("-")
+    return " ".join(parts)
+
+
+def _last_rows(table: Path) -> list[dict[str, str]]:
+    """The last whole rows of a table, without reading all of it."""
+    try:
+        with open(table, "rb") as file:
+            header = file.readline().decode()
+            start = max(file.seek(0, os.SEEK_END) - _TAIL_BYTES, len(header))
+            file.seek(start)
+            text = file.read(_TAIL_BYTES).decode(errors="replace")
+    except OSError:
+        return []
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    if start > len(header):
+        lines = lines[1:]  # cut in the middle
+    return list(csv.DictReader([header, *lines]))
+
+
+def _summary(file: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(file.read_text())
+        return values if isinstance(values, dict) else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _speed(rows: Sequence[dict[str, str]]) -> float:
+    """Decisions per second over the last rows of train.csv."""
+    if len(rows) < 2:
+        return math.nan
+    first, last = rows[max(len(rows) - 10, 0)], rows[-1]
+    seconds = _number(last, "wall_time_s") - _number(first, "wall_time_s")
+    return (_number(last, "decision_steps") - _number(first, "decision_steps")) / seconds if seconds > 0 else math.nan
+
+
+def _number(row: Any, name: str, default: float = math.nan) -> float:
+    return _float(row.get(name), default)
+
+
+def _float(value: Any, default: float = math.nan) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return default
