@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import io
+import multiprocessing
+import os
 
 import pytest
 import torch
@@ -12,6 +15,7 @@ pytest.importorskip("dm_control")
 pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import Task, check_env, get_task, make_env, register_task  # noqa: E402
+from torchrl_etdmpc.envs.make import _SilentWithoutOwner  # noqa: E402
 
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("imageio") is None, reason="needs gymnasium[mujoco]")
 
@@ -228,3 +232,21 @@ def test_on_a_gpu_every_entry_is_there(name):
     env = make_env(name, seed=0, device="cuda")
     check_env_specs(env)
     assert all(value.device.type == "cuda" for value in env.rollout(3).values(True, True))
+
+
+def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
+    class LeftError(BaseException):
+        pass
+
+    def leave(code: int) -> None:
+        raise LeftError(code)
+
+    monkeypatch.setattr(os, "_exit", leave)
+    sentinel, owner = multiprocessing.Pipe(duplex=False)
+    text = io.StringIO()
+    stderr = _SilentWithoutOwner(text, sentinel.fileno())
+    stderr.write("a warning")
+    owner.close()  # as the system does when the owner's process ends
+    with pytest.raises(LeftError):
+        print("Traceback", file=stderr)
+    assert text.getvalue() == "a warning"

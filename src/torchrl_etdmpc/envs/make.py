@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import multiprocessing.connection
 import os
 import signal
+import sys
 from collections.abc import Callable
 from functools import partial
+from typing import Any, TextIO
 
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv
@@ -125,7 +129,25 @@ def _make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
 
     Ctrl-C and job schedulers signal all processes of a job at once. TorchRL calls this once in the owner's process too.
     """
+    process = multiprocessing.parent_process()
+    if process is not None and os.getpid() != owner:
+        sys.stderr = _SilentWithoutOwner(sys.stderr, process.sentinel)
     if os.getpid() != owner and hasattr(signal, "SIGALRM"):
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
             signal.signal(number, lambda *_: signal.alarm(_GRACE_S))
     return make(device="cpu")
+
+
+class _SilentWithoutOwner:
+    """The stderr of a worker. One whose owner was killed finds its pipe broken; it ends without a traceback."""
+
+    def __init__(self, stream: TextIO, owner: int) -> None:
+        self._stream, self._owner = stream, owner
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        if multiprocessing.connection.wait([self._owner], 0.05):  # it may just be going
+            os._exit(1)
+        return self._stream.write(text)
