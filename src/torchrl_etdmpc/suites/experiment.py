@@ -89,8 +89,8 @@ class Experiment:
             _require(not doubled, f"{what} of experiment {self.name} must differ, got {doubled[:1]} more than once.")
         for name in self.variants:
             _require(
-                name not in (".", "..") and not set("/\\:=") & set(name) and name == name.strip(),
-                f"a variant's name becomes a folder's, so it has no / \\ : or =, got {name!r}.",
+                name not in (".", "..") and not set("/\\:=,") & set(name) and name == name.strip(),
+                f"a variant's name becomes a folder's, so it has none of / \\ : = and commas, got {name!r}.",
             )
         _require(
             self.base is None or self.base in self.variants,
