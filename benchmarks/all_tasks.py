@@ -67,15 +67,13 @@ def exercise(task: str, preset_name: str, device: torch.device) -> dict[str, obj
         collector.step()
 
     def update(*, distill: bool):
-        batch = replay.sample().to(device).reshape(-1, config.loss.slice_len)
+        batch = replay.sample().to(device)
         return agent.updater.step(batch, distill=distill)
 
     update(distill=False)  # pretraining
     _, plan_s = timed(device, collector.step)
     batch, reanalyze_s = timed(device, lambda: reanalyze.refresh(replay.sample()))
-    metrics, update_s = timed(
-        device, lambda: agent.updater.step(batch.to(device).reshape(-1, config.loss.slice_len), distill=True)
-    )
+    metrics, update_s = timed(device, lambda: agent.updater.step(batch.to(device), distill=True))
     collector.shutdown()
     values = {name: float(value) for name, value in metrics.items()}
     broken = [name for name, value in values.items() if not math.isfinite(value)]

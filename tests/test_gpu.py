@@ -48,7 +48,7 @@ def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
     for _ in range(70):
         collector.step()
     for _ in range(2 * reanalyze.interval):
-        metrics = agent.updater.step(replay.sample().to("cuda").reshape(-1, config.loss.slice_len))
+        metrics = agent.updater.step(replay.sample().to("cuda"))
     assert reanalyze.refreshed > 0
     assert all(value.isfinite() and value.is_cuda for value in metrics.values())
     eval_env = env.append_transform(agent.eval_planner.make_tensordict_primer())
@@ -64,10 +64,10 @@ def test_an_update_never_waits_for_the_device(compile_mode):
     rows["collector", "traj_ids"] = torch.arange(60) // 3
     replay.extend(rows.to("cuda"))
     for _ in range(3):  # compilation, and the sampler's first look at the rows
-        agent.updater.step(replay.sample().reshape(-1, 3))
+        agent.updater.step(replay.sample())
     torch.cuda.set_sync_debug_mode("error")
     try:
-        agent.updater.step(replay.sample().reshape(-1, 3))
+        agent.updater.step(replay.sample())
     finally:
         torch.cuda.set_sync_debug_mode("default")
 

@@ -168,6 +168,7 @@ def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, train, st
     assert results(tmp_path / "run") == straight
 
 
+@pytest.mark.slow  # six worker processes, half a minute
 def test_a_signal_that_reaches_the_environments_too_is_left_to_the_run(tmp_path, train):
     (tmp_path / "straight").mkdir()
     finish(train(tmp_path / "straight", "run_dir=run", "num_envs=2"))

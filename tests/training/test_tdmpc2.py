@@ -130,6 +130,7 @@ def test_an_agent_file_holds_the_critic(tmp_path, small_config):
     assert steps[0] == steps[1]
 
 
+@pytest.mark.slow  # compiles for a minute
 @needs_compiler
 def test_compiled_plans_and_updates_equal_eager_ones(small_config):
     compiled, eager = (build_agent(small_config(compile=setting), 5, 1) for setting in ("default", "off"))

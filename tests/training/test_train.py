@@ -478,7 +478,7 @@ def test_the_paper_s_method_runs_on_a_real_task(task, sizes, iterations):
     collector = build_collector(config, agent, env, replay)
 
     def update(*, distill: bool = True) -> TensorDict:
-        return agent.updater.step(replay.sample().reshape(-1, config.loss.slice_len), distill=distill)
+        return agent.updater.step(replay.sample(), distill=distill)
 
     for _ in range(12):
         collector.step()

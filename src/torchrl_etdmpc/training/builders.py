@@ -74,7 +74,10 @@ def build_replay(
     rows = min(config.replay.capacity, config.total_decisions + config.num_envs)
     with named_settings("loss", config.loss):
         sampler = StepSliceSampler(
-            config.loss.slice_len, uniform_over=config.replay.uniform_over, partial=config.replay.partial
+            config.loss.slice_len,
+            uniform_over=config.replay.uniform_over,
+            partial=config.replay.partial,
+            as_slices=True,
         )
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(rows, device=replay_device(config, device, rows * row_bytes(*sizes))),

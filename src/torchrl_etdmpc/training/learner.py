@@ -105,7 +105,7 @@ class Learner:
 
     def update(self, *, distill: bool = True, measured: bool = True) -> None:
         """One gradient step on a fresh sample, of the policy too with ``distill``; counted in the row if measured."""
-        batch = self.replay.sample().to(self.agent.device).reshape(-1, self.config.loss.slice_len)
+        batch = self.replay.sample().to(self.agent.device)
         metrics = self.agent.updater.step(batch, distill=distill)
         if measured:
             self._updates.add(dict(metrics.items()))
