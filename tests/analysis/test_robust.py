@@ -135,7 +135,7 @@ def test_different_tasks_cannot_be_compared():
 
 
 def test_scores_are_read_at_the_step_and_runs_that_do_not_reach_it_are_left_out():
-    rows = [("a", "x", 1, 0, 0.0), ("a", "x", 1, 100, 10.0)]  # between two evaluations
+    rows = [("a", "x", 1, 25, 0.0), ("a", "x", 1, 75, 10.0)]  # between two evaluations
     rows += [("a", "x", 2, 50, 7.0)]  # exactly there
     rows += [("a", "x", 3, 0, 1.0), ("a", "x", 3, 49, 1.0), ("a", "x", 4, 51, 1.0)]  # ended, not yet begun
     rows += [("a", "y", 1, 50, np.nan)]  # no return

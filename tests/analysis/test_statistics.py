@@ -137,7 +137,8 @@ def test_interpolation_never_extrapolates_and_stays_between_its_neighbours(data,
     steps, means = data
     table = interpolate(curve(steps, means), np.array(sorted(grid), dtype=float))
     for row in table.itertuples():
-        before = [mean for step, mean in zip(steps, means, strict=True) if step <= row.env_steps]
+        # an evaluation at 0 is of the untrained agent: it counts there, and no line leaves it
+        before = [mean for step, mean in zip(steps, means, strict=True) if min(1, row.env_steps) <= step <= row.env_steps]
         after = [mean for step, mean in zip(steps, means, strict=True) if step >= row.env_steps]
         if before and after:
             low, high = sorted((before[-1], after[0]))
@@ -165,15 +166,36 @@ def test_interpolation_by_hand():
 
 
 def test_curves_on_different_grids_meet_on_one():
-    coarse, fine = curve([0, 100], [0.0, 10.0]), curve([0, 25, 50, 75, 100], [0, 2.5, 5.0, 7.5, 10.0], method="b")
-    result = interpolate(pd.concat([coarse, fine]), np.array([10.0, 60.0]))
+    coarse, fine = curve([5, 105], [0.0, 10.0]), curve([5, 30, 55, 80, 105], [0, 2.5, 5.0, 7.5, 10.0], method="b")
+    result = interpolate(pd.concat([coarse, fine]), np.array([15.0, 65.0]))
     assert result["method"].tolist() == ["a", "a", "b", "b"]
     np.testing.assert_allclose(result["mean"], [1.0, 6.0, 1.0, 6.0])
 
 
+def test_no_line_leaves_the_evaluation_of_the_untrained_agent_unless_asked_for():
+    table = pd.concat([curve([0, 100, 200], [0.0, 10.0, 30.0], errors=1.0), curve([0], [7.0], errors=1.0, method="b")])
+    grid = np.array([0.0, 1.0, 99.0, 100.0, 150.0])
+    result = interpolate(table, grid)
+    nan = np.nan
+    np.testing.assert_array_equal(result["mean"], [0, nan, nan, 10, 20, 7, nan, nan, nan, nan])
+    np.testing.assert_array_equal(result["standard_error"].isna(), result["mean"].isna())
+    np.testing.assert_array_equal(result["seeds"].isna(), result["mean"].isna())
+    thesis = interpolate(table, grid, from_zero=True)
+    np.testing.assert_allclose(thesis["mean"], [0, 0.1, 9.9, 10, 20, 7, nan, nan, nan, nan])
+
+
+def test_a_curve_without_an_evaluation_on_the_grid_before_its_first_has_no_area_unless_asked_for():
+    table = seed_curves({1: {0: 0.0, 100: 10.0, 200: 10.0}, 2: {0: 0.0, 200: 20.0}})
+    grid = np.array([0.0, 100.0, 200.0])
+    assert auc_standard_error(table, grid)["standard_error"].isna().all()
+    assert auc_standard_error(table, grid, from_zero=True)["standard_error"].notna().all()
+    late = interpolate(curve([0, 200], [0.0, 20.0]), grid)
+    assert np.isnan(area(late))
+
+
 def test_seeds_on_different_grids_are_interpolated_one_by_one():
-    table = seed_estimates(seed_curves({1: {0: 0.0, 100: 10.0}, 2: {50: 20.0, 70: 30.0}}))
-    result = interpolate(table, np.array([0.0, 60.0]))
+    table = seed_estimates(seed_curves({1: {10: 0.0, 110: 10.0}, 2: {60: 20.0, 80: 30.0}}))
+    result = interpolate(table, np.array([10.0, 70.0]))
     assert result["seed"].tolist() == [1, 1, 2, 2]
     np.testing.assert_allclose(result["mean"], [0.0, 6.0, np.nan, 25.0])
 
@@ -184,8 +206,8 @@ def test_an_unknown_standard_error_stays_unknown():
 
 
 def test_a_return_that_is_not_a_number_is_bridged_by_the_seeds_other_evaluations():
-    table = seed_estimates(seed_curves({1: {0: 0.0, 50: np.nan, 100: 10.0}}))
-    np.testing.assert_allclose(interpolate(table, np.array([50.0]))["mean"], [5.0])
+    table = seed_estimates(seed_curves({1: {10: 0.0, 60: np.nan, 110: 10.0}}))
+    np.testing.assert_allclose(interpolate(table, np.array([60.0]))["mean"], [5.0])
 
 
 # The shared grid
@@ -242,7 +264,7 @@ def test_normalised_by_itself_the_normaliser_is_one_at_the_budget_with_the_same_
 
 
 def test_the_normaliser_is_read_between_evaluations_and_missing_where_the_curve_has_ended():
-    parts = [curve([0, 4e5], [0.0, 8.0], method="BMPC"), curve([0, 1e5], [0.0, 9.0], method="BMPC", task="y")]
+    parts = [curve([1e5, 3e5], [0.0, 8.0], method="BMPC"), curve([0, 1e5], [0.0, 9.0], method="BMPC", task="y")]
     constants = normalisers(pd.concat([*parts, curve([0, 4e5], 100.0)]), 200_000)
     assert constants.to_dict() == {"x": 4.0}
 
@@ -355,7 +377,9 @@ def test_the_area_is_linear_in_the_curve_and_blind_to_the_order_of_rows(data, sc
 @small
 @given(data=steps_and_means(), more=st.sets(st.floats(0, 1), max_size=4))
 def test_a_finer_grid_leaves_the_area_of_a_curve_of_straight_pieces_unchanged(data, more):
-    steps, _ = data
+    steps, means = data
+    steps = [step + 1 for step in steps]  # none at 0, from which no line leaves
+    data = steps, means
     finer = np.union1d(steps, steps[0] + np.array(sorted(more)) * (steps[-1] - steps[0]))
     assert area(interpolate(curve(*data), finer)) == pytest.approx(area(curve(*data)), abs=1e-6)
 
@@ -367,9 +391,9 @@ def test_an_area_by_hand():
 
 
 def test_a_curve_that_does_not_cover_the_grid_has_no_area_and_the_others_keep_theirs():
-    table = pd.concat([curve([0, 1e6], 1.0), curve([0, 9e5], 1.0, method="b"), curve([1e5, 1e6], 1.0, method="c")])
-    result = auc(interpolate(table, np.array([0, 5e5, 1e6])))
-    np.testing.assert_allclose(result["auc"], [1.0, np.nan, np.nan])
+    table = pd.concat([curve([1, 1e6], 1.0), curve([1, 9e5], 1.0, method="b"), curve([1e5, 1e6], 1.0, method="c")])
+    result = auc(interpolate(table, np.array([1, 5e5, 1e6])))
+    np.testing.assert_allclose(result["auc"], [0.999999, np.nan, np.nan])
 
 
 @small
@@ -384,9 +408,9 @@ def test_the_error_of_an_area_is_that_of_the_seeds_areas_whose_mean_is_the_area_
 
 
 def test_seeds_on_unequal_grids_each_have_their_own_area():
-    table = seed_curves({1: {0: 1.0, 1e6: 1.0}, 2: {0: 0.0, 2.5e5: 0.5, 1e6: 2.0}})
-    (row,) = auc_standard_error(table, np.array([0, 5e5, 1e6])).itertuples()
-    assert row.standard_error == pytest.approx(0.0)  # both areas are 1: a constant and the line 2 x
+    table = seed_curves({1: {1e6: 1.0, 2e6: 1.0}, 2: {1e6: 0.0, 1.25e6: 0.5, 2e6: 2.0}})
+    (row,) = auc_standard_error(table, np.array([1e6, 1.5e6, 2e6])).itertuples()
+    assert row.standard_error == pytest.approx(0.0)  # both areas are 1: a constant and the line 2 x - 2
 
 
 @pytest.mark.parametrize("seeds", [{1: {0: 1.0, 10: 2.0}}, {1: {0: 1.0, 10: 2.0}, 2: {0: 1.0, 9: 2.0}}])

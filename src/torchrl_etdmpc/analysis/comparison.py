@@ -81,6 +81,7 @@ def compare(
     budget: int | None = None,
     grid_step: int = 100_000,
     start: int | None = None,
+    from_zero: bool = False,
 ) -> Comparison:
     """Tables of areas and final returns by the protocol of thesis appendix A.1.2.
 
@@ -93,6 +94,8 @@ def compare(
         budget (int, optional): env steps. Default: the benchmark's.
         grid_step (int): env steps between the points of the shared grid.
         start (int, optional): first point of the grid. Default: the first that all methods have.
+        from_zero (bool): draws a line from the evaluation of the untrained agent to the next one, see
+            :func:`interpolate`; for the thesis' own tables only.
 
     Raises:
         ValueError: if the grid has fewer than two points, or the budget is no multiple of its step.
@@ -107,12 +110,12 @@ def compare(
     seed_curves = seed_curves[seed_curves["task"].isin(tasks) & seed_curves["method"].isin(methods)]
     grid = shared_grid(estimates, budget, grid_step, start=start)
 
-    on_grid = normalise(interpolate(estimates, grid), constants)
-    errors = auc_standard_error(normalise(seed_curves, constants), grid)
+    on_grid = normalise(interpolate(estimates, grid, from_zero=from_zero), constants)
+    errors = auc_standard_error(normalise(seed_curves, constants), grid, from_zero=from_zero)
     areas = auc(on_grid).merge(errors, on=["method", "task"], how="left")
     areas = pd.concat([areas, _aggregate_rows(areas.rename(columns={"auc": "mean"}), tasks, "auc")])
 
-    finals = interpolate(estimates, np.array([float(budget)])).drop(columns="env_steps")
+    finals = interpolate(estimates, np.array([float(budget)]), from_zero=from_zero).drop(columns="env_steps")
     finals = pd.concat([finals, _aggregate_rows(normalise(finals, constants), tasks, "mean")])
     parts = {"areas": areas.reset_index(drop=True), "finals": finals.reset_index(drop=True)}
     notes = tuple(_notes(seed_curves, estimates, constants, tasks, methods, budget, parts["areas"]))

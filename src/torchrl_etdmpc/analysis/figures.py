@@ -167,8 +167,8 @@ def plot_auc(areas: pd.DataFrame, *, methods: Sequence[str], ylabel: str) -> Fig
 
 
 def _line(axis, curve: pd.DataFrame, style: dict[str, str], budget: float) -> None:
-    """The curve up to the budget, with its interval; no marker where nothing was evaluated."""
-    curve = curve.dropna(subset="mean")
+    """The curve from the first evaluation of the trained agent to the budget, with its interval."""
+    curve = curve[curve["env_steps"] > 0].dropna(subset="mean")
     if curve.empty:
         return
     steps = curve["env_steps"].to_numpy(float)

@@ -2,7 +2,8 @@
 
 Pure functions on tidy tables. *Estimates* have one row per method, task and step: ``method, task, env_steps, mean,
 standard_error, seeds``, further columns are kept. ``standard_error`` is NaN where it is not known: for one seed, or for
-a published mean without one. Steps are environment steps; nothing is ever extrapolated.
+a published mean without one. Steps are environment steps; nothing is ever extrapolated, neither beyond the last
+evaluation nor before the first: an evaluation at 0 env steps is of the untrained agent, and no line joins it to the next.
 """
 
 from __future__ import annotations
@@ -54,8 +55,11 @@ def add_interval(estimates: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
-    """Every curve on a grid of steps: linear in between, NaN outside of the curve.
+def interpolate(estimates: pd.DataFrame, grid: np.ndarray, *, from_zero: bool = False) -> pd.DataFrame:
+    """Every curve on a grid of steps: linear between two evaluations of the trained agent, NaN where there are not two.
+
+    An evaluation at 0 env steps counts at 0 and nowhere else: between it and the next one nobody measured what was
+    learned, so that a method is *not evaluated* before its first evaluation after 0.
 
     The standard error is interpolated like the mean, which is exact if the errors of neighbouring evaluations are
     perfectly correlated and too large otherwise. ``seeds`` is the smaller count of the two neighbours.
@@ -63,20 +67,28 @@ def interpolate(estimates: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
     Args:
         estimates (DataFrame): one curve per method and task, and per seed if there is such a column.
         grid (array): env steps, increasing.
+        from_zero (bool): also draws the line from the evaluation at 0 to the next one, as the thesis does where a curve
+            lacks an evaluation on its grid.
 
     Returns:
         DataFrame: estimates at the steps of the grid.
+
+    >>> columns = {"method": "a", "task": "x", "standard_error": 1.0, "seeds": 3}
+    >>> curve = pd.DataFrame({**columns, "env_steps": [0, 100, 200], "mean": [5.0, 20.0, 40.0]})
+    >>> interpolate(curve, np.array([0, 50, 100, 150, 250]))["mean"].tolist()
+    [5.0, nan, 20.0, 30.0, nan]
     """
     grid = np.asarray(grid, dtype=float)
     tables = []
     key = _curve_key(estimates)
     for names, curve in estimates.groupby(key, sort=False):
         curve = curve.sort_values("env_steps")
+        steps, seeds = curve["env_steps"].to_numpy(float), curve["seeds"].to_numpy(float)
+        untrained = (grid > 0) & (grid < steps[steps > 0].min(initial=np.inf)) & (not from_zero)
         columns = {
-            name: np.interp(grid, curve["env_steps"], curve[name], left=np.nan, right=np.nan)
+            name: np.where(untrained, np.nan, np.interp(grid, steps, curve[name], left=np.nan, right=np.nan))
             for name in ("mean", "standard_error")
         }
-        steps, seeds = curve["env_steps"].to_numpy(float), curve["seeds"].to_numpy(float)
         after = np.clip(np.searchsorted(steps, grid), 0, len(steps) - 1)
         before = np.clip(np.searchsorted(steps, grid, side="right") - 1, 0, len(steps) - 1)
         columns["seeds"] = np.where(np.isnan(columns["mean"]), np.nan, np.fmin(seeds[before], seeds[after]))
@@ -210,7 +222,7 @@ def auc(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*key, "auc", "seeds"])
 
 
-def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray) -> pd.DataFrame:
+def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray, *, from_zero: bool = False) -> pd.DataFrame:
     """Standard error of the mean over seeds of their areas (thesis D.1: areas per seed, then their mean).
 
     NaN for one seed, and where a seed's own curve does not cover the grid.
@@ -218,11 +230,12 @@ def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray) -> pd.DataFr
     Args:
         seed_curves (DataFrame): normalised or not.
         grid (array): env steps.
+        from_zero (bool): see :func:`interpolate`.
 
     Returns:
         DataFrame: ``method, task, standard_error``.
     """
-    areas = auc(interpolate(seed_estimates(seed_curves), grid))
+    areas = auc(interpolate(seed_estimates(seed_curves), grid, from_zero=from_zero))
     groups = areas.groupby(["method", "task"], sort=False)["auc"]
     errors = groups.agg(lambda values: values.std(skipna=False) / np.sqrt(len(values)))
     return errors.rename("standard_error").reset_index()
