@@ -144,7 +144,9 @@ def test_methods_with_other_checkpoints_meet_on_the_shared_grid():
 
 
 def test_seeds_with_other_checkpoints_than_each_other_have_their_own_areas():
-    one, other = (seed_curves("odd", lambda *_: 400.0, seeds=(n,), steps=s) for n, s in ((1, STEPS), (2, (0, 5e4, 2e5))))
+    one, other = (
+        seed_curves("odd", lambda *_: 400.0, seeds=(n,), steps=s) for n, s in ((1, STEPS), (2, (0, 5e4, 2e5)))
+    )
     comparison = run(pd.concat([OURS, one, other]))
     assert cell(comparison.areas, "odd", "walker-run")["auc"] == pytest.approx(0.2)
     assert cell(comparison.areas, "odd", "walker-run")["standard_error"] == pytest.approx(0)

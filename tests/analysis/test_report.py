@@ -17,7 +17,7 @@ from torchrl_etdmpc.analysis import AGGREGATE, Comparison, compare, get_benchmar
 
 TASKS = ("walker-walk", "walker-run")
 STEPS = (0, 100_000, 200_000)
-TEXTS = {"auc.csv", "auc.md", "final.csv", "final.md", "index.md"}
+TEXTS = {"auc.csv", "auc.md", "final.csv", "final.md", "index.md", "returns.csv"}
 FIGURES = {"curves", "aggregate", "auc"}
 FILES = TEXTS | {f"{name}.png" for name in FIGURES}
 

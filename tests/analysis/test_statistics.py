@@ -138,7 +138,9 @@ def test_interpolation_never_extrapolates_and_stays_between_its_neighbours(data,
     table = interpolate(curve(steps, means), np.array(sorted(grid), dtype=float))
     for row in table.itertuples():
         # an evaluation at 0 is of the untrained agent: it counts there, and no line leaves it
-        before = [mean for step, mean in zip(steps, means, strict=True) if min(1, row.env_steps) <= step <= row.env_steps]
+        before = [
+            mean for step, mean in zip(steps, means, strict=True) if min(1, row.env_steps) <= step <= row.env_steps
+        ]
         after = [mean for step, mean in zip(steps, means, strict=True) if step >= row.env_steps]
         if before and after:
             low, high = sorted((before[-1], after[0]))

@@ -21,7 +21,17 @@ ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "report.py"
 HEADER = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes\n"
 PER_SEED = "method,task,seed,env_steps,return_mean\n"
-FILES = {"auc.csv", "auc.md", "final.csv", "final.md", "index.md", "curves.png", "aggregate.png", "auc.png"}
+FILES = {
+    "auc.csv",
+    "auc.md",
+    "final.csv",
+    "final.md",
+    "index.md",
+    "curves.png",
+    "aggregate.png",
+    "auc.png",
+    "returns.csv",
+}
 # Evaluations at 0 and 100,000 env steps: the number of the seed with 00 and with 50 behind it.
 ROWS = "".join(f"{steps},{steps // 2},7,1.0,{{seed}}{steps // 2000:02d},0.5,10\n" for steps in (0, 100_000))
 
@@ -33,6 +43,7 @@ def make_run(
     run.mkdir(parents=True)
     (run / "config.yaml").write_text(f"task: {task}\npreset: {preset}\nseed: {seed}\n")
     (run / "eval.csv").write_text(HEADER + ROWS.format(seed=seed) if text is None else text)
+    (run / "summary.json").write_text("{}")  # it is finished
     return run
 
 
@@ -170,8 +181,8 @@ def test_names_make_methods_of_folders_and_options_are_obeyed(run_main, capfd):
     out, err = capfd.readouterr()
     assert out == "3 runs on 1 task of Easy DMC, up to 100,000 env steps; the report is deep/er/index.md\n"
     assert err == ""
-    pdfs = {"curves.pdf", "aggregate.pdf", "auc.pdf"}
-    assert {path.name for path in Path("deep", "er").iterdir()} == FILES | pdfs
+    more = {"curves.pdf", "aggregate.pdf", "auc.pdf", "paired.csv"}
+    assert {path.name for path in Path("deep", "er").iterdir()} == FILES | more
     header = Path("deep", "er", "auc.md").read_text().splitlines()[0]
     assert header == "| task | first | utd4 | second | BMPC |"
     assert "Evaluation grid of the AUC: 0 to 100,000 every 50,000" in Path("deep", "er", "index.md").read_text()
@@ -278,7 +289,8 @@ def test_the_same_method_task_and_seed_twice_is_refused(refused):
 def test_the_same_method_task_and_seed_twice_is_refused_where_the_name_of_one_is_given(refused):
     make_run("runs/a")
     make_run("runs/b")
-    assert "two curves of cpu on walker-walk with seed 1" in refused("runs/a", "cpu=runs/b", "--reference")
+    error = refused("runs/a", "cpu=runs/b", "--reference")
+    assert error.startswith("two runs of cpu on walker-walk with seed 1: runs/a and runs/b; leave one out")
 
 
 def test_a_seed_in_two_baseline_files_does_not_count_twice(refused):
@@ -314,7 +326,9 @@ def test_an_option_that_makes_no_sense_is_refused(refused, arguments, message):
 
 
 def test_a_run_without_configuration_and_summary_is_refused(refused):
-    (make_run("runs/a") / "config.yaml").unlink()
+    run = make_run("runs/a")
+    (run / "config.yaml").unlink()
+    (run / "summary.json").unlink()
     assert refused("runs") == "runs/a has neither config.yaml nor summary.json, which name its task and seed."
 
 
@@ -361,7 +375,8 @@ def test_runs_of_different_lengths_are_compared_at_the_largest_budget_that_all_r
     out, err = capfd.readouterr()
     assert out == (
         "2 runs on 1 task of Easy DMC, up to 200,000 env steps, compared at 100,000, which all of them reach (the "
-        "benchmark's budget is 200,000); the report is report/index.md\n"
+        "benchmark's budget is 200,000); 1 missing or unfinished (cpu on walker-walk with seed 1: ends at 100,000 env "
+        "steps, others at 200,000); the report is report/index.md\n"
     )
     assert err == ""
     assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 200
@@ -374,7 +389,12 @@ def test_a_short_run_has_a_report_without_dashes(run_main, capfd):
     assert "compared at 25,000, which all of them reach" in capfd.readouterr().out
     row = read_table(Path("report", "final.csv"))["walker-walk"]
     assert float(row["cpu"]) == 250
-    assert row["BMPC"] not in ("", "-")
+    assert float(row["TD-MPC"]) > 0
+    assert "BMPC" not in row  # its first evaluation is at 100,000
+    page = Path("report", "index.md").read_text()
+    assert re.search(
+        r"^- Not evaluated by 25,000 env steps on these tasks, so left out: .*BMPC \(from 100,000\)", page, re.M
+    )
 
 
 def test_a_run_that_has_only_begun_is_named(refused):
@@ -387,7 +407,9 @@ def test_a_run_that_has_only_begun_is_named(refused):
 def test_one_broken_run_is_skipped_and_named(run_main, capfd):
     make_run("runs/a")
     make_run("runs/b", seed=2, text=HEADER + "0,0,7,1.0,much,0.5,10\n")
-    (make_run("runs/c", seed=3) / "config.yaml").unlink()
+    lost = make_run("runs/c", seed=3)
+    (lost / "config.yaml").unlink()
+    (lost / "summary.json").unlink()
     run_main("runs", "--reference")
     out, err = capfd.readouterr()
     assert out.startswith("1 run on 1 task of Easy DMC")

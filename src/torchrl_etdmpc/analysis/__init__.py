@@ -21,9 +21,20 @@ from torchrl_etdmpc.analysis.benchmarks import (
     get_benchmark,
     own_benchmark,
 )
-from torchrl_etdmpc.analysis.comparison import Comparison, compare, merge_estimates
-from torchrl_etdmpc.analysis.curves import find_runs, join_curves, read_curves, read_run, read_runs
+from torchrl_etdmpc.analysis.comparison import Comparison, begins, compare, merge_estimates
+from torchrl_etdmpc.analysis.curves import (
+    Run,
+    find_runs,
+    join_curves,
+    join_runs,
+    read_curves,
+    read_points,
+    read_run,
+    read_runs,
+)
+from torchrl_etdmpc.analysis.experiment import Experiment, experiment_root, incomplete_runs, read_experiment
 from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run
+from torchrl_etdmpc.analysis.paired import compare_paired
 from torchrl_etdmpc.analysis.report import write_report
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
 from torchrl_etdmpc.analysis.statistics import (
@@ -38,6 +49,7 @@ from torchrl_etdmpc.analysis.statistics import (
     seed_estimates,
     shared_grid,
 )
+from torchrl_etdmpc.analysis.steps import MEAN, STEPS, no_points, returns_at
 from torchrl_etdmpc.analysis.tables import AGGREGATE, rank_methods, result_table, to_csv, to_markdown
 
 del matplotlib, pandas, scipy, yaml
@@ -46,23 +58,33 @@ __all__ = [
     "AGGREGATE",
     "BENCHMARKS",
     "HUMANOIDBENCH_HARD",
+    "MEAN",
+    "STEPS",
     "Benchmark",
     "Comparison",
+    "Experiment",
     "Interval",
+    "Run",
     "add_interval",
     "aggregate",
     "auc",
     "auc_standard_error",
+    "begins",
     "benchmark_of",
     "compare",
+    "compare_paired",
     "estimate",
+    "experiment_root",
     "find_runs",
     "get_benchmark",
+    "incomplete_runs",
     "interpolate",
     "interquartile_mean",
     "join_curves",
+    "join_runs",
     "merge_estimates",
     "method_styles",
+    "no_points",
     "normalise",
     "normalisers",
     "own_benchmark",
@@ -73,9 +95,12 @@ __all__ = [
     "probability_of_improvement",
     "rank_methods",
     "read_curves",
+    "read_experiment",
+    "read_points",
     "read_run",
     "read_runs",
     "result_table",
+    "returns_at",
     "scores_at",
     "seed_estimates",
     "shared_grid",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from torchrl_etdmpc.analysis.benchmarks import Benchmark
+from torchrl_etdmpc.analysis.paired import compare_paired
 from torchrl_etdmpc.analysis.statistics import (
     NORMALISER,
     aggregate,
@@ -20,6 +21,7 @@ from torchrl_etdmpc.analysis.statistics import (
     normalisers,
     shared_grid,
 )
+from torchrl_etdmpc.analysis.steps import STEPS, no_points, returns_at
 from torchrl_etdmpc.analysis.tables import AGGREGATE
 
 
@@ -40,6 +42,9 @@ class Comparison:
             task.
         finals (DataFrame): ``method, task, mean, standard_error, seeds``, returns at the budget, the aggregate
             normalised.
+        points (DataFrame): quoted means ``method, task, env_steps, mean, source`` of the tasks, up to the budget.
+        returns (DataFrame): at fixed steps, of methods and points, see :func:`returns_at`.
+        paired (DataFrame): differences between variants, see :func:`compare_paired`; no row if none was asked for.
         notes (tuple of str): what a reader must know about the data.
     """
 
@@ -53,6 +58,9 @@ class Comparison:
     constants: pd.Series
     areas: pd.DataFrame
     finals: pd.DataFrame
+    points: pd.DataFrame
+    returns: pd.DataFrame
+    paired: pd.DataFrame
     notes: tuple[str, ...]
 
 
@@ -82,6 +90,10 @@ def compare(
     grid_step: int = 100_000,
     start: int | None = None,
     from_zero: bool = False,
+    points: pd.DataFrame | None = None,
+    steps: Sequence[int] = STEPS,
+    base: str | None = None,
+    variants: Sequence[str] = (),
 ) -> Comparison:
     """Tables of areas and final returns by the protocol of thesis appendix A.1.2.
 
@@ -96,6 +108,10 @@ def compare(
         start (int, optional): first point of the grid. Default: the first that all methods have.
         from_zero (bool): draws a line from the evaluation of the untrained agent to the next one, see
             :func:`interpolate`; for the thesis' own tables only.
+        points (DataFrame, optional): quoted means, see :func:`read_points`.
+        steps (sequence of int): env steps at which returns are tabled, those within the budget.
+        base (str, optional): with which ``variants`` are compared, paired by task and seed.
+        variants (sequence of str): methods of ``seed_curves``.
 
     Raises:
         ValueError: if the grid has fewer than two points, or the budget is no multiple of its step.
@@ -103,9 +119,13 @@ def compare(
     tasks = tuple(tasks or benchmark.tasks)
     budget = budget or benchmark.budget
     estimates = merge_estimates(seed_curves, means)
+    points = no_points() if points is None else points
+    points = points[points["task"].isin(tasks) & (points["env_steps"] <= budget)].reset_index(drop=True)
     constants = normalisers(estimates[estimates["task"].isin(benchmark.tasks)], benchmark.budget)
     estimates = estimates[estimates["task"].isin(tasks)]
+    notes = [*_both_ways(seed_curves, means, tasks)]
     methods = tuple(methods or dict.fromkeys([*seed_curves["method"], *means["method"]]))
+    notes += _left_out(estimates[~estimates["method"].isin(methods)], budget)
     estimates = estimates[estimates["method"].isin(methods)]
     seed_curves = seed_curves[seed_curves["task"].isin(tasks) & seed_curves["method"].isin(methods)]
     grid = shared_grid(estimates, budget, grid_step, start=start)
@@ -117,9 +137,28 @@ def compare(
 
     finals = interpolate(estimates, np.array([float(budget)]), from_zero=from_zero).drop(columns="env_steps")
     finals = pd.concat([finals, _aggregate_rows(normalise(finals, constants), tasks, "mean")])
-    parts = {"areas": areas.reset_index(drop=True), "finals": finals.reset_index(drop=True)}
-    notes = tuple(_notes(seed_curves, estimates, constants, tasks, methods, budget, parts["areas"]))
-    return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **parts)
+    within = [step for step in steps if step <= budget]
+    tables = {
+        "areas": areas.reset_index(drop=True),
+        "finals": finals.reset_index(drop=True),
+        "points": points,
+        "returns": returns_at(estimates, points, steps=within, tasks=tasks, methods=methods),
+        "paired": compare_paired(
+            seed_curves, base=base or "", variants=variants, env_steps=budget, tasks=tasks, constants=constants
+        ),
+    }
+    known = (seed_curves, estimates, constants, tasks, methods, budget, tables["areas"], tables["finals"])
+    notes = (*_notes(*known), *notes)
+    return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **tables)
+
+
+def begins(curves: pd.DataFrame) -> pd.Series:
+    """The first evaluation of the trained agent by method and task, those at 0 env steps apart.
+
+    Args:
+        curves (DataFrame): seed curves or estimates.
+    """
+    return curves[curves["env_steps"] > 0].groupby(["method", "task"], sort=False)["env_steps"].min()
 
 
 def _aggregate_rows(table: pd.DataFrame, tasks: tuple[str, ...], column: str) -> pd.DataFrame:
@@ -135,6 +174,7 @@ def _notes(
     methods: tuple[str, ...],
     budget: int,
     areas: pd.DataFrame,
+    finals: pd.DataFrame,
 ) -> Iterator[str]:
     """What a reader of the figures must know about the data behind them."""
     missing = int(seed_curves["return_mean"].isna().sum())
@@ -149,13 +189,13 @@ def _notes(
     unknown = [name for name in methods if areas[areas["method"] == name]["standard_error"].isna().all()]
     if unknown:
         yield f"No interval of the AUC for {', '.join(unknown)}: it needs the curves of at least two seeds."
-    there = estimates[estimates["env_steps"] == budget]["method"]
-    between = [name for name in methods if name not in set(there)]
-    between = [name for name in between if (estimates[estimates["method"] == name]["env_steps"] > budget).any()]
+    there = set(zip(*(estimates[estimates["env_steps"] == budget][name] for name in ("method", "task")), strict=True))
+    known = finals[(finals["task"] != AGGREGATE) & finals["mean"].notna()]
+    between = [row.method for row in known.itertuples() if (row.method, row.task) not in there]
     if between:
         yield (
-            f"{', '.join(between)}: not evaluated at {budget:,} env steps; values there lie on the straight line "
-            "between the neighbouring evaluations."
+            f"{', '.join(dict.fromkeys(between))}: not evaluated at {budget:,} env steps; values there lie on the "
+            "straight line between the neighbouring evaluations."
         )
     without = [task for task in tasks if task not in constants.index]
     if without:
@@ -172,3 +212,29 @@ def _notes(
         absent = [task for task in tasks if task not in set(rows["task"])]
         if absent:
             yield f"{method} has no curve on {', '.join(absent)}."
+    yield from _late(estimates, methods, budget)
+
+
+def _late(estimates: pd.DataFrame, methods: tuple[str, ...], budget: int) -> Iterator[str]:
+    """Where the curves of methods begin, if others are evaluated earlier."""
+    first = begins(estimates).groupby(level="method").max().reindex(methods).dropna()
+    late = first[first > first.min()]
+    if len(late):
+        names = ", ".join(f"{method} from {step:,.0f}" for method, step in late.items())
+        yield f"Not evaluated before their first evaluation after 0 env steps, on one task at least: {names}."
+
+
+def _left_out(estimates: pd.DataFrame, budget: int) -> Iterator[str]:
+    """Methods that have nothing to show up to the budget."""
+    first = begins(estimates).groupby(level="method").min()
+    if len(late := first[first > budget]):
+        names = ", ".join(f"{method} (from {step:,.0f})" for method, step in late.items())
+        yield f"Not evaluated by {budget:,} env steps on these tasks, so left out: {names}."
+
+
+def _both_ways(seed_curves: pd.DataFrame, means: pd.DataFrame, tasks: tuple[str, ...]) -> Iterator[str]:
+    """Methods of which two sets of runs are published on a task."""
+    known = [set(zip(t["method"], t["task"], strict=True)) for t in (seed_curves, means)]
+    both = dict.fromkeys(method for method, task in sorted(known[0] & known[1]) if task in tasks)
+    if both:
+        yield f"Published per seed and, of other runs, as means: {', '.join(both)}; the curves per seed are used."

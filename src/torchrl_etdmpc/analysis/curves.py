@@ -13,6 +13,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
 from torchrl_etdmpc.runs import RunDirectory
 
 SEED_COLUMNS = ("method", "task", "seed", "env_steps", "return_mean")
+POINT_COLUMNS = ("method", "task", "env_steps", "mean", "source")
 ESTIMATE_COLUMNS = ("method", "task", "env_steps", "mean", "standard_error", "seeds")
 _EVAL = RunDirectory("").eval.name
 _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
@@ -52,6 +54,41 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     return sorted(runs)
 
 
+@dataclass(frozen=True)
+class Run:
+    """What a report knows of one run directory.
+
+    Args:
+        path (Path): the directory.
+        method (str): how figures and tables call it.
+        task (str): its task.
+        seed (int): its seed.
+        finished (bool): whether it reached its budget.
+        curve (DataFrame): seed curve, see :func:`read_run`.
+    """
+
+    path: Path
+    method: str
+    task: str
+    seed: int
+    finished: bool
+    curve: pd.DataFrame
+
+    @classmethod
+    def read(cls, run_dir: str | os.PathLike[str], *, method: str | None = None) -> Run:
+        """Reads the files of a run; see :func:`read_run`."""
+        directory, header, table = RunDirectory(run_dir), read_header(run_dir), read_evaluations(run_dir)
+        _check_units(table.assign(task=header["task"]), directory.eval)
+        names = {"method": method or header["preset"], "task": header["task"], "seed": header["seed"]}
+        columns = {name: table[name].astype(float) for name in ("env_steps", "return_mean")}
+        return cls(directory.path, **names, finished=directory.finished, curve=pd.DataFrame({**names, **columns}))
+
+    @property
+    def last(self) -> float:
+        """Env steps of the last evaluation, NaN if there is none."""
+        return self.curve["env_steps"].max()
+
+
 def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> pd.DataFrame:
     """The seed curve of one run, which may still be running.
 
@@ -70,17 +107,7 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
         FileNotFoundError: a file is missing.
         ValueError: a file is not what it should be, or counts steps in other units.
     """
-    header, table = read_header(run_dir), read_evaluations(run_dir)
-    _check_units(table.assign(task=header["task"]), RunDirectory(run_dir).eval)
-    return pd.DataFrame(
-        {
-            "method": method or header["preset"],
-            "task": header["task"],
-            "seed": header["seed"],
-            "env_steps": table["env_steps"].astype(float),
-            "return_mean": table["return_mean"].astype(float),
-        }
-    )
+    return Run.read(run_dir, method=method).curve
 
 
 def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
@@ -99,7 +126,8 @@ def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
         )
     text = files[0].read_text(encoding="utf-8", errors="replace")
     try:
-        values = json.loads(text) if files[0] == directory.summary else yaml.safe_load(text)
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is there
+        values = json.loads(text) if files[0] == directory.summary else yaml.load(text, loader)
         header = {key: values[key] for key in ("task", "preset", "seed")}
     except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
         raise ValueError(f"{files[0]} does not give the run's task, preset and seed.") from error
@@ -129,18 +157,25 @@ def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = N
         FileNotFoundError: no run in one of the paths.
         ValueError: two runs of the same method, task and seed, or a file that cannot be read.
     """
+    return join_runs([Run.read(run_dir, method=method) for run_dir in find_runs(paths)])
+
+
+def join_runs(runs: Iterable[Run]) -> pd.DataFrame:
+    """The seed curves of runs, at least one.
+
+    Raises:
+        ValueError: two runs of the same method, task and seed.
+    """
     tables, seen = [], {}
-    for run_dir in find_runs(paths):
-        table = read_run(run_dir, method=method)
-        header = read_header(run_dir)
-        key = (method or header["preset"], header["task"], header["seed"])
+    for run in runs:
+        key = (run.method, run.task, run.seed)
         if key in seen:
             raise ValueError(
-                f"two runs of {key[0]} on {key[1]} with seed {key[2]}: {seen[key]} and {run_dir}; leave one out, or "
+                f"two runs of {key[0]} on {key[1]} with seed {key[2]}: {seen[key]} and {run.path}; leave one out, or "
                 "give one of them a name of its own."
             )
-        seen[key] = run_dir
-        tables.append(table)
+        seen[key] = run.path
+        tables.append(run.curve)
     return pd.concat(tables, ignore_index=True)
 
 
@@ -180,6 +215,35 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
         row = double.iloc[0]
         raise ValueError(f"{file} has two rows for {', '.join(f'{name}={row[name]}' for name in key)}; keep one.")
     return table[list(columns)].sort_values(key, ignore_index=True)
+
+
+def read_points(file: str | os.PathLike[str]) -> pd.DataFrame:
+    """Single means that are quoted from publications: never joined to a line, never interpolated.
+
+    Args:
+        file (str or Path): a CSV file with the columns ``method, task, env_steps, mean, source``; the source is a text
+            without which a number is no quote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not a CSV file, missing columns or cells, a step of 0, or two rows for one point.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"no such file of quoted points: {file}.")
+    table = _parse(file.read_text(encoding="utf-8", errors="replace"), file, POINT_COLUMNS)
+    _numbers(table, ["env_steps", "mean"], file)
+    wrong = table["source"].isna() | table["mean"].isna() | (table["env_steps"] == 0)
+    if wrong.any():
+        raise ValueError(f"{file}: every point needs a source, a mean and env_steps above 0.")
+    double = table[table.duplicated(["method", "task", "env_steps"])]
+    if len(double):
+        row = double.iloc[0]
+        raise ValueError(
+            f"{file} has two rows for method={row['method']}, task={row['task']}, env_steps={row['env_steps']:g}; "
+            "keep one."
+        )
+    return table[list(POINT_COLUMNS)]
 
 
 def join_curves(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:

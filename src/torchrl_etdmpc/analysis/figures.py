@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,15 +15,35 @@ from matplotlib.ticker import EngFormatter
 
 from torchrl_etdmpc.analysis.curves import read_evaluations, read_header
 from torchrl_etdmpc.analysis.statistics import Z_95, add_interval, interpolate
+from torchrl_etdmpc.analysis.steps import no_points
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.files import replacing
 
 # The palette of Okabe and Ito, which people with any colour vision tell apart. Published baselines keep their colour in
-# every report; the rest goes to the runs in their order.
-_BASELINES = {"BMPC": "#D55E00", "TD-MPC2": "#009E73", "DreamerV3": "#CC79A7", "SAC": "#E69F00"}
+# every report; the rest goes to the runs in their order. There are more baselines than colours of that palette: others
+# have one of Paul Tol's, and dashes where they are another version of a method.
+_BASELINES = {
+    "BMPC": ("#D55E00", "-", "s"),
+    "TD-MPC2": ("#009E73", "-", "^"),
+    "DreamerV3": ("#CC79A7", "-", "D"),
+    "SAC": ("#E69F00", "-", "v"),
+    "DR.Q": ("#882255", "-", "P"),
+    "WIMLE": ("#117733", "-", "X"),
+    "TD-MPC": ("#44AA99", "-", "<"),
+    "SimBa": ("#332288", "-", ">"),
+    "SimbaV2-UTD2": ("#AA4499", "-", "p"),
+    "SimbaV2-UTD8": ("#AA4499", "--", "h"),
+    "SAC (pytorch_sac)": ("#E69F00", "--", "d"),
+    "DreamerV3 (author)": ("#CC79A7", "--", "*"),
+    "DC-MPC": ("#D55E00", "", "s"),
+    "EfficientZero V2": ("#CC3311", "", "P"),
+    "FoG": ("#666666", "", "X"),
+    "MR.Q": ("#882255", "", "o"),
+    "SAC (EZ-V2's figure)": ("#E69F00", "", "v"),
+    "TD-MPC2 (EZ-V2's figure)": ("#009E73", "", "^"),
+}
 _RUNS = ("#0072B2", "#56B4E9", "#000000")
 _DASHES = ("-", "--", ":", "-.")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -34,8 +55,7 @@ def method_styles(methods: Sequence[str]) -> dict[str, dict[str, str]]:
     styles, others = {}, 0
     for method in methods:
         if method in _BASELINES:
-            index = list(_BASELINES).index(method)
-            styles[method] = {"color": _BASELINES[method], "linestyle": "-", "marker": _MARKERS[1 + index]}
+            styles[method] = dict(zip(("color", "linestyle", "marker"), _BASELINES[method], strict=True))
         else:
             color, dash = _RUNS[others % len(_RUNS)], _DASHES[others // len(_RUNS) % len(_DASHES)]
             styles[method] = {"color": color, "linestyle": dash, "marker": "o"}
@@ -77,20 +97,36 @@ def plot_run(run_dir: str | os.PathLike[str]) -> Path:
     return directory.curve
 
 
-def plot_curves(estimates: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str], budget: float) -> Figure:
+def plot_curves(
+    estimates: pd.DataFrame,
+    *,
+    tasks: Sequence[str],
+    methods: Sequence[str],
+    budget: float,
+    points: pd.DataFrame | None = None,
+) -> Figure:
     """A grid of tasks: mean return against env steps, shaded 95% intervals (none where the standard error is unknown).
+
+    Lines begin at the first evaluation after 0 env steps; the untrained agent is a marker at 0.
 
     Args:
         estimates (DataFrame): of returns.
         tasks (sequence of str): one panel each.
         methods (sequence of str): in the order of the legend.
         budget (float): right end of the axis, env steps.
+        points (DataFrame, optional): quoted means, drawn as hollow markers that no line joins.
     """
-    columns = min(len(tasks), 4 if len(tasks) > 4 else 2)
+    points = no_points() if points is None else points[points["task"].isin(tasks) & (points["env_steps"] <= budget)]
+    quoted = list(dict.fromkeys(points["method"]))
+    columns = min(len(tasks), 4 if len(tasks) > 6 else 3 if len(tasks) > 4 else 2)
     rows = -(-len(tasks) // columns)
-    figure = Figure(figsize=(max(3.1 * columns, 4.5), 2.4 * rows + 0.8), layout="constrained")
+    names = [*methods, *(f"{name}, quoted" for name in quoted)]
+    width = max(3.1 * columns, 6.2 if len(names) > 6 else 4.5)
+    legend = _legend_columns(names, width)
+    figure = Figure(figsize=(width, 2.4 * rows + 0.4 + 0.2 * -(-len(names) // legend)), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
-    styles = method_styles(methods)
+    styles = method_styles([*methods, *quoted])
+    unclipped = {"clip_on": False, "in_layout": False}  # whole markers at the ends of the axis
     for place, (axis, task) in enumerate(zip(axes.flat, tasks, strict=False)):
         for method in methods:
             curve = estimates[(estimates["task"] == task) & (estimates["method"] == method)]
@@ -103,7 +139,11 @@ def plot_curves(estimates: pd.DataFrame, *, tasks: Sequence[str], methods: Seque
                 marker=styles[method]["marker"],
                 linestyle="none",
                 markersize=3,
+                **unclipped,
             )
+        for method in quoted:
+            here = points[(points["task"] == task) & (points["method"] == method)]
+            axis.plot(here["env_steps"], here["mean"], **_hollow(styles[method]), markersize=5, **unclipped)
         axis.set_title(task, fontsize=10)
         _dress(axis, budget)
         if place + columns >= len(tasks):
@@ -112,7 +152,7 @@ def plot_curves(estimates: pd.DataFrame, *, tasks: Sequence[str], methods: Seque
             axis.set_ylabel("episode return", fontsize=9)
     for axis in axes.flat[len(tasks) :]:
         axis.remove()
-    _legend(figure, methods, styles, columns=5 if columns > 1 else 3)
+    _legend(figure, methods, styles, columns=legend, quoted=quoted)
     return figure
 
 
@@ -125,7 +165,10 @@ def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: 
         budget (float): right end of the axis, env steps.
         ylabel (str): what the values are.
     """
-    figure = Figure(figsize=(4.8, 3.4), layout="constrained")
+    drawn = set(aggregates.dropna(subset="mean")["method"])
+    named = [method for method in methods if method in drawn]
+    legend = _legend_columns(named, 4.8)
+    figure = Figure(figsize=(4.8, 3.0 + 0.2 * -(-len(named) // legend)), layout="constrained")
     axis = figure.subplots()
     styles = method_styles(methods)
     for method in methods:
@@ -134,7 +177,7 @@ def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: 
     _dress(axis, budget)
     axis.set_xlabel("environment steps")
     axis.set_ylabel(ylabel)
-    _legend(figure, methods, styles, columns=3)
+    _legend(figure, named, styles, columns=legend)
     return figure
 
 
@@ -188,7 +231,25 @@ def _dress(axis, budget: float) -> None:
     axis.tick_params(labelsize=8)
 
 
-def _legend(figure: Figure, methods: Sequence[str], styles: dict[str, dict[str, str]], *, columns: int) -> None:
+def _legend_columns(names: Sequence[str], width: float) -> int:
+    """How many columns of a legend fit into a figure of this width in inches."""
+    longest = max(map(len, names), default=0)
+    return min(max(int(width / (0.6 + 0.07 * longest)), 1), max(len(names), 1))
+
+
+def _hollow(style: dict[str, str]) -> dict[str, Any]:
+    """The look of a quoted point."""
+    return {"color": style["color"], "marker": style["marker"], "linestyle": "none", "markerfacecolor": "none"}
+
+
+def _legend(
+    figure: Figure,
+    methods: Sequence[str],
+    styles: dict[str, dict[str, str]],
+    *,
+    columns: int,
+    quoted: Sequence[str] = (),
+) -> None:
     handles = [Line2D([], [], linewidth=1.5, markersize=4, label=method, **styles[method]) for method in methods]
-    columns = min(len(methods), columns)
+    handles += [Line2D([], [], markersize=5, label=f"{name}, quoted", **_hollow(styles[name])) for name in quoted]
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 
 from torchrl_etdmpc.analysis.comparison import Comparison
 from torchrl_etdmpc.analysis.figures import plot_aggregate, plot_auc, plot_curves
+from torchrl_etdmpc.analysis.paired import paired_markdown
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
 from torchrl_etdmpc.analysis.statistics import (
     NORMALISER,
@@ -23,14 +25,21 @@ from torchrl_etdmpc.analysis.statistics import (
     interpolate,
     normalise,
 )
+from torchrl_etdmpc.analysis.steps import MEAN, overview, step_table
 from torchrl_etdmpc.analysis.tables import AGGREGATE, result_table, to_csv, to_markdown
 from torchrl_etdmpc.runs.files import replacing
 
 
 def write_report(
-    comparison: Comparison, out: str | os.PathLike[str], *, vector: Literal["pdf", "svg"] | None = None
+    comparison: Comparison,
+    out: str | os.PathLike[str],
+    *,
+    vector: Literal["pdf", "svg"] | None = None,
+    incomplete: Sequence[str] = (),
 ) -> Path:
-    """Writes ``auc.csv``, ``final.csv``, their Markdown, the figures and ``index.md``.
+    """Writes ``auc.csv``, ``final.csv``, their Markdown, ``returns.csv``, ``paired.csv``, the figures and ``index.md``.
+
+    ``returns.csv`` (at fixed steps) and ``paired.csv`` are there where the comparison has such rows.
 
     Every file is written beside its name first and all are moved into place at the end, so that an error leaves the old
     report as it was.
@@ -39,6 +48,7 @@ def write_report(
         comparison (Comparison): see :func:`compare`.
         out (path): folder; made if missing, files of the same name are replaced.
         vector (str, optional): also writes every figure in this format.
+        incomplete (sequence of str): lines on runs that are missing or not finished, see :func:`incomplete_runs`.
 
     Returns:
         Path: of ``index.md``.
@@ -46,7 +56,7 @@ def write_report(
     out = Path(out)
     files = _tables(comparison)
     figures = _figures(comparison)
-    files["index.md"] = _page(comparison, files, list(figures))
+    files["index.md"] = _page(comparison, files, incomplete)
     contents = {name: text.encode() for name, text in files.items()}
     for name, figure in figures.items():
         for ending in filter(None, ("png", vector)):
@@ -55,7 +65,9 @@ def write_report(
     with contextlib.ExitStack() as stack:
         for name, content in contents.items():
             stack.enter_context(replacing(out / name)).write_bytes(content)
-    for ending in {"pdf", "svg"} - {vector}:  # of an earlier report, of other data
+    for name in {"returns.csv", "paired.csv"} - set(contents):  # of an earlier report, of other data
+        (out / name).unlink(missing_ok=True)
+    for ending in {"pdf", "svg"} - {vector}:
         for name in figures:
             (out / f"{name}.{ending}").unlink(missing_ok=True)
     return out / "index.md"
@@ -76,12 +88,21 @@ def _wide(comparison: Comparison, values: pd.DataFrame, column: str) -> list[pd.
 
 def _tables(comparison: Comparison) -> dict[str, str]:
     areas, finals = _wide(comparison, comparison.areas, "auc"), _wide(comparison, comparison.finals, "mean")
-    return {
+    files = {
         "auc.csv": to_csv(*areas),
         "auc.md": to_markdown(*areas[:2], digits=3),
         "final.csv": to_csv(*finals),
         "final.md": to_markdown(*finals[:2], digits={**dict.fromkeys(comparison.tasks, 1), AGGREGATE: 3}),
     }
+    sources = comparison.points.drop_duplicates("method").set_index("method")["source"]
+    long = {
+        "returns.csv": comparison.returns.assign(source=comparison.returns["method"].map(sources)),
+        "paired.csv": comparison.paired,
+    }
+    for name, table in long.items():
+        if len(table):
+            files[name] = table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return files
 
 
 def _figures(comparison: Comparison) -> dict[str, Figure]:
@@ -92,13 +113,13 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     areas = comparison.areas[comparison.areas["task"] == AGGREGATE]
     options = {"methods": comparison.methods, "budget": comparison.budget}
     return {
-        "curves": plot_curves(comparison.estimates, tasks=comparison.tasks, **options),
+        "curves": plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options),
         "aggregate": plot_aggregate(curves, ylabel=normalised, **options),
         "auc": plot_auc(areas, methods=comparison.methods, ylabel="normalised AUC"),
     }
 
 
-def _page(comparison: Comparison, files: dict[str, str], figures: list[str]) -> str:
+def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[str]) -> str:
     benchmark, grid = comparison.benchmark, comparison.grid
     count, total = len(comparison.tasks), len(benchmark.tasks)
     scope = f"all {total} tasks" if count == total else f"{count} of its {total} tasks, over which aggregates are taken"
@@ -111,14 +132,20 @@ def _page(comparison: Comparison, files: dict[str, str], figures: list[str]) -> 
         f"Budget {comparison.budget:,} environment steps; {scope}. Evaluation grid of the AUC: {grid[0]:,.0f} to "
         f"{grid[-1]:,.0f} every {grid[1] - grid[0]:,.0f} env steps, trapezoid rule, env steps in millions. "
         + normalised
-        + "In brackets: number of seeds of each figure. Best in bold, second best in italics; a dash is unavailable.\n",
+        + "In brackets: number of seeds of each figure. Best in bold, second best in italics. "
+        "A dash is not evaluated: no value is made up before a method's first evaluation of the trained agent, beyond "
+        "its last one, or for a task that it lacks.\n",
+        _incomplete(incomplete),
+        _steps(comparison),
+        _paired(comparison),
         "## Area under the normalised learning curve\n",
         files["auc.md"],
         f"![areas](auc.png)\n\n## Return at {comparison.budget:,} environment steps\n",
-        "The last row is the mean of normalised returns.\n",
+        "Of runs and published curves; the last row is the mean of normalised returns.\n",
         files["final.md"],
         "## Learning curves\n",
-        "Mean over seeds; shaded: 95% interval, 1.96 standard errors.\n",
+        "Mean over seeds; shaded: 95% interval, 1.96 standard errors. A line begins at the first evaluation of the "
+        "trained agent; a marker at 0 is the untrained one. Hollow markers are quoted, and belong to no line.\n",
         "![learning curves](curves.png)\n\n![aggregate](aggregate.png)\n",
         _intervals(comparison),
         _robust(comparison),
@@ -126,6 +153,71 @@ def _page(comparison: Comparison, files: dict[str, str], figures: list[str]) -> 
     if comparison.notes:
         parts.append("## About the data\n\n" + "\n".join(f"- {note}" for note in comparison.notes) + "\n")
     return "\n".join(part for part in parts if part)
+
+
+def _incomplete(lines: Sequence[str]) -> str:
+    if not lines:
+        return ""
+    return "## Missing and unfinished runs\n\n" + "\n".join(f"- {line}" for line in lines) + "\n"
+
+
+def _steps(comparison: Comparison) -> str:
+    """Returns at fixed steps, of every method that has one, quoted ones included."""
+    returns, points = comparison.returns, comparison.points
+    if returns.empty:
+        return ""
+    names = {"tasks": comparison.tasks, "methods": [*comparison.methods, *dict.fromkeys(points["method"])]}
+    steps = sorted(returns["env_steps"].unique())
+    parts = [
+        "## Returns at fixed numbers of environment steps\n",
+        f"Mean return over the {len(comparison.tasks)} tasks, best at the last step first; a mean over fewer tasks "
+        "says so, and compares with no other. In square brackets: 95% interval, 1.96 standard errors; in round ones: "
+        "seeds; both where they are known. ≈ lies on the straight line between two evaluations of the trained "
+        "agent; – was not evaluated there.\n",
+        overview(returns, **names),
+        _same_tasks(comparison),
+    ]
+    for step in steps:
+        here = set(returns[returns["env_steps"] == step]["method"])
+        absent = [name for name in names["methods"] if name not in here]
+        parts += [f"### At {step:,.0f} environment steps\n", step_table(returns, step, **names)]
+        if absent:
+            parts.append(f"Not evaluated at {step:,.0f} on any of these tasks: {', '.join(absent)}.\n")
+    sources = points[points["env_steps"].isin(steps)].drop_duplicates("method")
+    if len(sources):
+        parts.append("Quoted numbers, which nobody here has measured, without intervals and seeds:\n")
+        parts.append("".join(f"- {row.method}: {row.source}\n" for row in sources.itertuples()))
+    return "\n".join(part for part in parts if part)
+
+
+def _same_tasks(comparison: Comparison) -> str:
+    """Beside every mean over fewer tasks, the first method's over the same ones."""
+    first, lines = comparison.methods[0], []
+    by_task = comparison.returns[comparison.returns["task"] != MEAN]
+    for (step, method), rows in by_task.groupby(["env_steps", "method"], sort=False):
+        ours = by_task[(by_task["env_steps"] == step) & (by_task["method"] == first)]
+        ours = ours[ours["task"].isin(rows["task"])]
+        if method != first and len(rows) < len(comparison.tasks) and len(ours) == len(rows):
+            lines.append(
+                f"- On the {len(rows)} tasks of {method} at {step:,.0f}: {method} {rows['mean'].mean():.0f}, "
+                f"{first} {ours['mean'].mean():.0f}.\n"
+            )
+    return "".join(lines)
+
+
+def _paired(comparison: Comparison) -> str:
+    table = comparison.paired
+    if table.empty:
+        return ""
+    against = f"{table['base'].iloc[0]}, paired by task and seed, at {comparison.budget:,} environment steps"
+    over = "Over tasks, differences are of normalised returns. " if (table["task"] == AGGREGATE).any() else ""
+    text = (
+        "Difference of returns, and probability that a run of the variant scores more than one of the base (ties "
+        f"half), of the runs that both have with the same task and seed. {over}In brackets: 95% percentile interval of "
+        "a bootstrap that resamples pairs within each task (2,000 resamples; narrower than it should be where pairs "
+        "are few, none with one pair on a task). Left out: runs of either without a partner.\n"
+    )
+    return "\n".join([f"## Variants against {against}\n", text, paired_markdown(table)])
 
 
 def _intervals(comparison: Comparison) -> str:

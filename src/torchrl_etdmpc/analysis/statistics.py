@@ -2,8 +2,8 @@
 
 Pure functions on tidy tables. *Estimates* have one row per method, task and step: ``method, task, env_steps, mean,
 standard_error, seeds``, further columns are kept. ``standard_error`` is NaN where it is not known: for one seed, or for
-a published mean without one. Steps are environment steps; nothing is ever extrapolated, neither beyond the last
-evaluation nor before the first: an evaluation at 0 env steps is of the untrained agent, and no line joins it to the next.
+a published mean without one. Steps are environment steps; nothing is ever extrapolated, neither beyond the
+last evaluation nor before the first: an evaluation at 0 env steps is of the untrained agent, and no line leaves it.
 """
 
 from __future__ import annotations

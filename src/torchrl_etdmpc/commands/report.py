@@ -3,9 +3,10 @@
   report runs/                               all runs below a folder
   report ours=runs/a other=runs/b --out report
   report runs/ --budget 50000 --grid-step 10000 --watch
+  report runs/exp --paired base              variants of an experiment against one of them
 
 Runs with the same name are seeds of one method; the name is the preset unless
-given (`NAME=PATH`).
+given (`NAME=PATH`), and the variant below a folder with an experiment.yaml.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from torchrl_etdmpc.runs import RunDirectory
 
 if TYPE_CHECKING:
-    from torchrl_etdmpc.analysis import Benchmark
+    from torchrl_etdmpc.analysis import Benchmark, Experiment, Run
 
 Table = Any  # of pandas, which is imported where it is used
 REFERENCE = Path(__file__).resolve().parents[1] / "analysis" / "reference"
@@ -42,8 +43,19 @@ def parse() -> argparse.Namespace:
         "--reference",
         nargs="*",
         metavar="CSV",
-        default=[REFERENCE / "bmpc.csv", REFERENCE / "tdmpc2.csv"],
-        help="files of baselines, per seed or as means; none for no baselines (default: BMPC, TD-MPC2, ...)",
+        default=[REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget")],
+        help="files of baselines, per seed or as means; none for no baselines (default: BMPC, TD-MPC2, DR.Q, ...)",
+    )
+    parser.add_argument(
+        "--points",
+        nargs="*",
+        metavar="CSV",
+        help="files of single means that are quoted with a source (default: DC-MPC, MR.Q, ..., unless --reference)",
+    )
+    parser.add_argument(
+        "--paired",
+        metavar="BASE",
+        help="compares the others with BASE, paired by task and seed (default: the first, where runs share any)",
     )
     parser.add_argument("--out", default="report", help="folder of the report (default: report)")
     parser.add_argument("--all-tasks", action="store_true", help="all tasks of the benchmark, not only those with runs")
@@ -51,14 +63,18 @@ def parse() -> argparse.Namespace:
         "--budget", type=int, help="env steps; default: the benchmark's, or the largest that all runs reach"
     )
     parser.add_argument("--grid-step", type=int, help="env steps between points of the AUC's grid (default: 100,000)")
+    parser.add_argument("--grid-start", type=int, help="first point of the AUC's grid (default: the runs' first)")
     parser.add_argument("--vector", choices=("pdf", "svg"), help="write every figure in this format as well")
     parser.add_argument(
         "--watch", nargs="?", type=float, const=30.0, metavar="SECONDS", help="refresh when new rows arrive, until ^C"
     )
     arguments = parser.parse_args()
+    if arguments.points is None:
+        theirs = arguments.reference is not parser.get_default("reference")
+        arguments.points = [] if theirs else [REFERENCE / "points.csv"]
     if arguments.benchmark is not None:
         get_benchmark(arguments.benchmark)  # a wrong name ends here, also when watching
-    for name in ("budget", "grid_step", "watch"):
+    for name in ("budget", "grid_step", "grid_start", "watch"):
         value = getattr(arguments, name)
         if value is not None and value <= 0:
             raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value:g}.")
@@ -73,53 +89,71 @@ def named(argument: str) -> tuple[str | None, str]:
     return None, os.path.expanduser(argument)
 
 
-def read(arguments: argparse.Namespace) -> tuple[Table, list[str]]:
-    """The runs' seed curves, and a line for each run that cannot be read.
+def read(arguments: argparse.Namespace) -> tuple[list[Run], list[Experiment], list[str]]:
+    """The runs, the experiments that are read whole, and a line for each run or experiment that cannot be read.
 
     Raises:
         ValueError, OSError: if there is no other run.
     """
-    from torchrl_etdmpc.analysis import find_runs, join_curves, read_run, read_runs
+    from torchrl_etdmpc.analysis import Run, experiment_root, find_runs, read_experiment
 
-    groups: dict[str | None, list[Path]] = {}
+    runs: list[Run] = []
     broken: dict[Path, Exception] = {}
+    roots: dict[Path, None] = {}
     for argument in arguments.runs:
         name, path = named(argument)
-        for run in find_runs([path]):
+        for folder in find_runs([path]):
+            root = None if name else experiment_root(folder)
+            if root is not None and (root == Path(path) or Path(path) in root.parents):
+                roots[root] = None
             try:
-                read_run(run)
-                groups.setdefault(name, []).append(run)
+                runs.append(Run.read(folder, method=name or (root and folder.relative_to(root).parts[0])))
             except (ValueError, OSError) as error:
-                broken[run] = error
-    if not groups:
+                broken[folder] = error
+    if not runs:
         raise next(iter(broken.values()))
-    runs = join_curves(read_runs(paths, method=name) for name, paths in groups.items())
-    return runs, [f"skipped {run}: {error}" for run, error in broken.items()]
+    lines = [f"skipped {run}: {error}" for run, error in broken.items()]
+    experiments = []
+    for root in roots:
+        try:
+            experiments.append(read_experiment(root))
+        except ValueError as error:
+            lines.append(str(error))
+    return runs, experiments, lines
 
 
-def choose_budget(arguments: argparse.Namespace, benchmark: Benchmark, runs: Table) -> tuple[int, int]:
-    """The budget and the step of the AUC's grid: those asked for, or the benchmark's, or what all runs reach.
+def choose_budget(
+    arguments: argparse.Namespace, benchmark: Benchmark, runs: Table, experiments: list[Experiment]
+) -> tuple[int, int]:
+    """The budget and the step of the AUC's grid: those asked for or planned, the benchmark's, or what all runs reach.
 
     Raises:
         ValueError: if a run has not got beyond its first evaluation.
     """
-    from torchrl_etdmpc.analysis import BENCHMARKS
+    from torchrl_etdmpc.analysis import BENCHMARKS, begins
 
     last = runs.groupby(["method", "task", "seed"])["env_steps"].max()
     reached = int(last.min())
+    planned = {plan.budget for plan in experiments if plan.budget and plan.budget <= last.max()}
+    step = None
     if arguments.budget or (reached >= benchmark.budget and benchmark.name in BENCHMARKS):
         budget, step = arguments.budget or benchmark.budget, DEFAULT_GRID_STEP
+    elif len(planned) == 1:  # a run that ended early is named, and does not shorten the others
+        (budget,) = planned
     elif reached:
         budget = min(reached, benchmark.budget)
-        step = next((budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0), None)
-        if step is None:
-            budget, step = budget - 1, (budget - 1) // 2
     else:
         method, task, seed = last.idxmin()
         raise ValueError(
             f"{method} on {task} with seed {seed} has only its first evaluation yet, at 0 env steps; wait, or leave "
             "that run out."
         )
+    if step is None:
+        first = begins(runs).max()
+        steps = [budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0]
+        step = next((step for step in steps if step >= first), steps[-1] if steps else None)
+        if step is None:
+            budget, step = budget - 1, (budget - 1) // 2
     return budget, arguments.grid_step or step
 
 
@@ -142,14 +176,23 @@ def choose_benchmark(arguments: argparse.Namespace, runs: Table) -> Benchmark:
     return own_benchmark(own, max(int(reached), 1))
 
 
-def report(arguments: argparse.Namespace, references: list[Table]) -> str:
+def report(arguments: argparse.Namespace, references: list[Table], points: Table) -> str:
     """Writes the report; returns a line for the terminal."""
     import pandas as pd
 
-    from torchrl_etdmpc.analysis import compare, join_curves, write_report
+    from torchrl_etdmpc.analysis import (
+        begins,
+        compare,
+        incomplete_runs,
+        join_curves,
+        join_runs,
+        merge_estimates,
+        write_report,
+    )
 
-    runs, skipped = read(arguments)
-    for line in skipped:
+    found, experiments, lines = read(arguments)
+    runs = join_runs(found)
+    for line in lines:
         print(line, file=sys.stderr, flush=True)
     if runs.empty:
         raise ValueError("no evaluation in any of the runs yet; wait for the first one.")
@@ -160,35 +203,79 @@ def report(arguments: argparse.Namespace, references: list[Table]) -> str:
     if chosen.empty:
         raise ValueError(f"no run on a task of {benchmark.name}; the runs are on {', '.join(present)}.")
     methods = list(dict.fromkeys(chosen["method"]))
-    budget, grid_step = choose_budget(arguments, benchmark, chosen)
+    budget, grid_step = choose_budget(arguments, benchmark, chosen, experiments)
     seeds, means = [chosen], []
     for table in references:
         known = table[table["task"].isin(benchmark.tasks)]
-        clash = sorted(set(known["method"]) & set(methods))
-        if clash:
-            raise ValueError(f"{clash[0]} names both runs and a baseline; give the runs another name (NAME=PATH).")
-        if not arguments.budget:  # a baseline that was first evaluated later has nothing to say here
-            begins = known.groupby("method")["env_steps"].transform("min")
-            known = known[begins <= budget - grid_step]
         (seeds if "return_mean" in table else means).append(known)
-    baselines = [name for name in dict.fromkeys(name for table in means + seeds[1:] for name in table["method"])]
+    refuse_clash(methods, [*means, *seeds[1:], points])
+    curves = join_curves(seeds)
+    published = join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"])
+    here = begins(merge_estimates(curves, published)).reset_index()
+    here = set(here[here["task"].isin(tasks) & (here["env_steps"] <= budget)]["method"])
+    baselines = [name for name in dict.fromkeys([*published["method"], *curves["method"]]) if name in here]
+    first = chosen.groupby("method")["env_steps"].min().max()
     comparison = compare(
-        join_curves(seeds),
-        join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"]),
+        curves,
+        published,
         benchmark=benchmark,
         tasks=tasks,
-        methods=(*methods, *baselines),
+        methods=tuple(dict.fromkeys([*methods, *baselines])),
         budget=budget,
         grid_step=grid_step,
+        start=arguments.grid_start or int(-(-first // grid_step) * grid_step),
+        points=points,
+        **choose_base(arguments, chosen, methods),
     )
-    page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector)
+    incomplete = incomplete_runs(found, experiments)
+    page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector, incomplete=incomplete)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]
     last = chosen["env_steps"].max()
     counts = f"{count} run{'s' * (count > 1)} on {len(tasks)} task{'s' * (len(tasks) > 1)} of {benchmark.title}"
     at = ""
     if not arguments.budget and budget != benchmark.budget:
-        at = f", compared at {budget:,}, which all of them reach (the benchmark's budget is {benchmark.budget:,})"
+        which = "which all of them reach" if budget <= reached(chosen) else "the budget of the experiment"
+        at = f", compared at {budget:,}, {which} (the benchmark's budget is {benchmark.budget:,})"
+    at += missing(incomplete)
     return f"{counts}, up to {last:,.0f} env steps{at}; the report is {page}"
+
+
+def reached(runs: Table) -> int:
+    """Env steps that all runs reach."""
+    return int(runs.groupby(["method", "task", "seed"])["env_steps"].max().min())
+
+
+def missing(lines: list[str], shown: int = 5) -> str:
+    """What the line for the terminal says of runs that are missing or not finished."""
+    if not lines:
+        return ""
+    more = f"; and {len(lines) - shown} more" if len(lines) > shown else ""
+    return f"; {len(lines)} missing or unfinished ({'; '.join(lines[:shown])}{more})"
+
+
+def refuse_clash(methods: list[str], tables: list[Table]) -> None:
+    """Raises ValueError if runs have the name of a baseline."""
+    clash = sorted({name for table in tables for name in table["method"]} & set(methods))
+    if clash:
+        raise ValueError(f"{clash[0]} names both runs and a baseline; give the runs another name (NAME=PATH).")
+
+
+def choose_base(arguments: argparse.Namespace, runs: Table, methods: list[str]) -> dict[str, Any]:
+    """The base and the variants that are compared with it, if there are any.
+
+    Raises:
+        ValueError: if no run has the name that was asked for.
+    """
+    if arguments.paired is None:
+        base = methods[0]
+        keys = {name: set(zip(rows["task"], rows["seed"], strict=True)) for name, rows in runs.groupby("method")}
+        variants = [name for name in methods[1:] if keys[name] & keys[base]]
+    elif arguments.paired in methods:
+        base = arguments.paired
+        variants = [name for name in methods if name != base]
+    else:
+        raise ValueError(f"--paired={arguments.paired} is no name of runs; choose one of {', '.join(methods)}.")
+    return {"base": base, "variants": variants}
 
 
 def stamp(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
@@ -203,18 +290,21 @@ def main() -> None:
     """Writes the report, once or again and again."""
     try:
         arguments = parse()
-        from torchrl_etdmpc.analysis import read_curves
+        import pandas as pd
+
+        from torchrl_etdmpc.analysis import no_points, read_curves, read_points
 
         references = [read_curves(file) for file in arguments.reference]
+        points = pd.concat([read_points(file) for file in arguments.points] or [no_points()], ignore_index=True)
         if arguments.watch is None:
-            print(report(arguments, references))
+            print(report(arguments, references, points))
             return
         seen = None
         while True:
             try:
                 now = stamp(arguments)
                 if now != seen:
-                    print(report(arguments, references), flush=True)
+                    print(report(arguments, references, points), flush=True)
                     seen = now
             except (ValueError, OSError) as error:  # a run that is just being made is complete the next time
                 print(f"waiting: {error}", file=sys.stderr, flush=True)

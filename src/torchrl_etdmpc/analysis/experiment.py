@@ -1,0 +1,111 @@
+"""Which runs an experiment should have, and which of them are missing or not finished."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
+from torchrl_etdmpc.analysis.curves import Run
+
+EXPERIMENT = "experiment.yaml"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A folder of runs ``<variant>/<task>/seed<N>`` with a list of what should be there.
+
+    Args:
+        root (Path): the folder.
+        variants (tuple of str): names of its folders.
+        tasks (tuple of str): task names.
+        seeds (tuple of int): seeds.
+        budget (int, optional): env steps of every run.
+    """
+
+    root: Path
+    variants: tuple[str, ...]
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    budget: int | None = None
+
+
+def read_experiment(root: Path) -> Experiment:
+    """Reads ``experiment.yaml``: ``variants`` (names, or a mapping by name), ``tasks``, ``seeds``, ``budget``.
+
+    Args:
+        root (Path): the folder that holds it.
+
+    Raises:
+        ValueError: if it does not list them; other keys are ignored.
+    """
+    file = root / EXPERIMENT
+    try:
+        values = yaml.load(file.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        tasks = values["tasks"]
+        tasks = BENCHMARKS[tasks].tasks if isinstance(tasks, str) and tasks in BENCHMARKS else tasks
+        lists = {"variants": (list(values["variants"]), str), "tasks": (tasks, str), "seeds": (values["seeds"], int)}
+        for name, (items, kind) in lists.items():
+            if not isinstance(items, list | tuple) or not items or not all(isinstance(item, kind) for item in items):
+                raise ValueError(name)
+        budget = values.get("budget")
+        if not (budget is None or isinstance(budget, int) and budget > 0):
+            raise ValueError("budget")
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise ValueError(
+            f"{file} does not list variants, tasks, seeds and a budget, so that nobody can say which runs are missing."
+        ) from error
+    return Experiment(root, *(tuple(items) for items, _ in lists.values()), budget=budget)
+
+
+def experiment_root(run: Path) -> Path | None:
+    """The folder above a run that holds an ``experiment.yaml``, if there is one (a task's name may have a slash)."""
+    return next((folder for folder in list(run.parents)[:5] if (folder / EXPERIMENT).is_file()), None)
+
+
+def incomplete_runs(runs: Sequence[Run], experiments: Iterable[Experiment] = ()) -> list[str]:
+    """Names every run that is missing or not finished, a line each.
+
+    A run is missing if its experiment lists it, or if another method of the same runs has one with this task and seed
+    on a task that both have. It is not finished without its summary, or if it ends before the budget of its experiment
+    or before the others on its task.
+
+    Args:
+        runs (sequence of Run): those that were read.
+        experiments (iterable of Experiment): of which the runs should be all.
+    """
+    experiments = list(experiments)
+    lines = list(_unfinished(runs, experiments))
+    there = {(run.method, run.task, run.seed) for run in runs}
+    planned = [
+        (variant, task, seed)
+        for plan in experiments
+        for variant in plan.variants
+        for task in plan.tasks
+        for seed in plan.seeds
+    ]
+    shared = Counter((task, seed) for _, task, seed in there)
+    if not experiments and max(shared.values(), default=0) > 1:
+        pairs = sorted({(method, task) for method, task, _ in there})
+        planned = [(method, task, seed) for method, task in pairs for other, seed in sorted(shared) if other == task]
+    missing = [key for key in planned if key not in there]
+    return lines + [f"{method} on {task} with seed {seed}: no run" for method, task, seed in missing]
+
+
+def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[str]:
+    longest: dict[str, float] = {}
+    for run in runs:
+        longest[run.task] = max(longest.get(run.task, 0.0), run.last)  # a NaN is never the larger one
+    for run in runs:
+        budget = next((plan.budget for plan in experiments if plan.root in run.path.parents), None)
+        target = budget or longest[run.task]
+        where = f"{run.method} on {run.task} with seed {run.seed}"
+        ends = f"ends at {run.last:,.0f} env steps" if run.last >= 0 else "has no evaluation"
+        if not run.finished:
+            yield f"{where}: not finished, {ends}"
+        elif not run.last >= target:
+            yield f"{where}: {ends}, {'its budget is' if budget else 'others at'} {target:,.0f}"

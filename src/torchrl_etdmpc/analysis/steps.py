@@ -1,0 +1,140 @@
+"""Returns at fixed env steps: of curves at or between their evaluations, of quoted points where they stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from torchrl_etdmpc.analysis.curves import POINT_COLUMNS
+from torchrl_etdmpc.analysis.statistics import add_interval, interpolate
+
+STEPS = (20_000, 50_000, 100_000, 200_000)
+MEAN = "Mean over tasks"
+DASH = "–"
+_COLUMNS = ("env_steps", "method", "task", "mean", "standard_error", "lower", "upper", "seeds", "tasks", "kind")
+
+
+def no_points() -> pd.DataFrame:
+    """A table of quoted points without a row."""
+    return pd.DataFrame(
+        {name: pd.Series(dtype=float if name in ("env_steps", "mean") else str) for name in POINT_COLUMNS}
+    )
+
+
+def returns_at(
+    estimates: pd.DataFrame,
+    points: pd.DataFrame,
+    *,
+    steps: Sequence[float],
+    tasks: Sequence[str],
+    methods: Sequence[str],
+) -> pd.DataFrame:
+    """Mean returns at fixed steps by task, and their mean over the tasks that have a value.
+
+    Args:
+        estimates (DataFrame): of curves.
+        points (DataFrame): quoted means ``method, task, env_steps, mean, source``; they count at their own step only.
+        steps (sequence of float): env steps.
+        tasks (sequence of str): the compared tasks.
+        methods (sequence of str): of the curves; those of the points come behind them.
+
+    Returns:
+        DataFrame: a row for every value that exists, ``env_steps, method, task, mean, standard_error, lower, upper,
+        seeds, tasks, kind``. ``kind`` is ``evaluated``, ``interpolated`` (between two evaluations) or ``quoted``. The
+        task :data:`MEAN` is the mean over ``tasks`` tasks, its standard error that of independent tasks.
+
+    >>> rows = [("a", "x", 50, 1.0, 0.3, 3), ("a", "y", 50, 2.0, 0.4, 5), ("a", "y", 90, 4.0, 0.4, 5)]
+    >>> curves = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"])
+    >>> table = returns_at(curves, no_points(), steps=[50, 70], tasks=["x", "y"], methods=["a"])
+    >>> table[["env_steps", "task", "mean", "standard_error", "tasks", "kind"]]
+       env_steps             task  mean  standard_error  tasks          kind
+    0       50.0                x   1.0            0.30      1     evaluated
+    1       50.0                y   2.0            0.40      1     evaluated
+    2       70.0                y   3.0            0.40      1  interpolated
+    3       50.0  Mean over tasks   1.5            0.25      2     evaluated
+    4       70.0  Mean over tasks   3.0            0.40      1  interpolated
+    """
+    grid = np.array(sorted(steps), dtype=float)
+    chosen = estimates[estimates["method"].isin(methods) & estimates["task"].isin(tasks)]
+    curves = interpolate(chosen, grid).dropna(subset="mean")
+    there = set(zip(chosen["method"], chosen["task"], chosen["env_steps"], strict=True))
+    here = zip(curves["method"], curves["task"], curves["env_steps"], strict=True)
+    curves = curves.assign(kind=["evaluated" if cell in there else "interpolated" for cell in here])
+    quoted = points[points["task"].isin(tasks) & points["env_steps"].isin(grid)]
+    quoted = quoted.drop(columns="source").assign(standard_error=np.nan, seeds=np.nan, kind="quoted")
+    table = pd.concat([part for part in (curves, quoted) if len(part)] or [curves], ignore_index=True).assign(tasks=1)
+    table = table.sort_values("env_steps", kind="stable", ignore_index=True)
+    groups = table.groupby(["env_steps", "method"], sort=False)
+    means = groups.agg(
+        mean=("mean", "mean"),
+        standard_error=("standard_error", lambda errors: np.sqrt(np.square(errors).sum(skipna=False)) / len(errors)),
+        seeds=("seeds", "min"),
+        tasks=("tasks", "sum"),
+        kind=("kind", "max"),  # interpolated if one of them is
+    )
+    table = pd.concat([table, means.reset_index().assign(task=MEAN)] if len(table) else [table], ignore_index=True)
+    return add_interval(table).reindex(columns=list(_COLUMNS))
+
+
+def step_table(returns: pd.DataFrame, step: float, *, tasks: Sequence[str], methods: Sequence[str]) -> str:
+    """One step as Markdown: a row per task and the mean, a column per method that has a value there.
+
+    Args:
+        returns (DataFrame): see :func:`returns_at`.
+        step (float): env steps.
+        tasks (sequence of str): rows.
+        methods (sequence of str): columns, in this order.
+    """
+    here = returns[returns["env_steps"] == step]
+    columns = [method for method in methods if method in set(here["method"])]
+    rows = {(row.method, row.task): row for row in here.itertuples()}
+    quoted = set(here[here["kind"] == "quoted"]["method"])
+    heads = [_escape(method) + " (quoted)" * (method in quoted) for method in columns]
+    lines = ["| task | " + " | ".join(heads) + " |", "|---" * (1 + len(columns)) + "|"]
+    for task in [*tasks, MEAN]:
+        cells = [_cell(rows.get((method, task)), len(tasks) if task == MEAN else 1) for method in columns]
+        lines.append(f"| {task} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def overview(returns: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str]) -> str:
+    """The means over tasks as Markdown: a row per method, a column per step, best first at the last step.
+
+    Args:
+        returns (DataFrame): see :func:`returns_at`.
+        tasks (sequence of str): all compared tasks; a mean over fewer says so and stands below the whole ones.
+        methods (sequence of str): rows; those without any value are left out.
+    """
+    means = returns[returns["task"] == MEAN]
+    steps = sorted(means["env_steps"].unique())
+    rows = {(row.method, row.env_steps): row for row in means.itertuples()}
+
+    def place(method: str) -> list[tuple[bool, float]]:
+        found = [rows.get((method, step)) for step in reversed(steps)]
+        return [(row is None or row.tasks < len(tasks), -row.mean if row is not None else 0.0) for row in found]
+
+    shown = sorted((method for method in methods if method in set(means["method"])), key=place)
+    quoted = set(means[means["kind"] == "quoted"]["method"])
+    lines = ["| method | " + " | ".join(f"{step:,.0f}" for step in steps) + " |", "|---" * (1 + len(steps)) + "|"]
+    for method in shown:
+        cells = [_cell(rows.get((method, step)), len(tasks)) for step in steps]
+        lines.append(f"| {_escape(method)}{' (quoted)' * (method in quoted)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row, tasks: int) -> str:
+    """A value with its interval and seeds, or a dash."""
+    if row is None:
+        return DASH
+    text = f"{'≈ ' * (row.kind == 'interpolated')}{row.mean:.0f}"
+    if not np.isnan(row.lower):
+        text += f" [{row.lower:.0f}, {row.upper:.0f}]"
+    if not np.isnan(row.seeds):
+        text += f" ({row.seeds:.0f})"
+    return text + (f", {row.tasks} of {tasks} tasks" if row.tasks < tasks else "")
+
+
+def _escape(name: str) -> str:
+    return name.replace("|", "\\|")
