@@ -15,7 +15,7 @@ pytest.importorskip("pandas")
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
-from torchrl_etdmpc.analysis import estimate, find_runs, read_curves, read_run, read_runs  # noqa: E402
+from torchrl_etdmpc.analysis import BENCHMARKS, estimate, find_runs, read_curves, read_points, read_run, read_runs  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
 
 REFERENCE = Path(__file__).resolve().parents[2] / "src" / "torchrl_etdmpc" / "analysis" / "reference"
@@ -363,3 +363,32 @@ def test_the_estimates_of_the_reference_seeds_are_those_of_numpy(published):
     assert len(returns) == row["seeds"] >= 3
     assert row["mean"] == pytest.approx(np.mean(returns))
     assert row["standard_error"] == pytest.approx(np.std(returns, ddof=1) / np.sqrt(len(returns)))
+
+
+def test_published_curves_and_quoted_points_name_tasks_of_the_benchmarks_and_their_sources():
+    known = {task for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
+    readme = (REFERENCE / "README.md").read_text(encoding="utf-8")
+    curves, points = read_curves(REFERENCE / "lowbudget.csv"), read_points(REFERENCE / "points.csv")
+    assert set(curves["task"]) | set(points["task"]) <= known
+    assert len(curves) == 1594 and len(points) == 585
+    sources = pd.read_csv(REFERENCE / "lowbudget.csv")["source"].str.split().str[0].unique()
+    for repository in sources:
+        assert f"github.com/{repository}" in readme
+    assert points[points["method"] == "FoG"]["source"].str.contains("the unit of its steps is unverified").all()
+    assert set(points["method"]).isdisjoint(curves["method"])
+
+
+@pytest.mark.parametrize(
+    "rows, message",
+    [
+        ("a,walker-walk,5,1,s\n" * 2, "has two rows for method=a, task=walker-walk, env_steps=5; keep one"),
+        ("a,walker-walk,5,1,\n", "every point needs a source, a mean and env_steps above 0"),
+        ("a,walker-walk,5,,s\n", "every point needs a source, a mean and env_steps above 0"),
+        ("a,walker-walk,0,1,s\n", "every point needs a source, a mean and env_steps above 0"),
+        ("a,walker-walk,5,much,s\n", "column mean must hold numbers"),
+    ],
+)
+def test_a_file_of_points_that_is_none_is_one_line(tmp_path, rows, message):
+    file = write(tmp_path / "points.csv", "method,task,env_steps,mean,source\n" + rows)
+    with pytest.raises(ValueError, match=message):
+        read_points(file)

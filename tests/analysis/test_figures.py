@@ -107,6 +107,40 @@ def test_curves_go_up_to_the_budget_and_markers_stand_at_evaluations_only():
         assert low == 0 and BUDGET <= high <= 1.05 * BUDGET
 
 
+def test_quoted_points_are_hollow_markers_that_nothing_joins_and_stand_in_the_legend():
+    rows = [
+        ("paper", TASKS[0], 20_000, 5.0, "s"),
+        ("paper", TASKS[0], 40_000, 7.0, "s"),
+        ("paper", "z", 20_000, 9.0, "s"),
+    ]
+    rows += [("paper", TASKS[0], BUDGET + 1, 8.0, "s")]
+    points = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "source"])
+    figure = plot_curves(estimates(), tasks=TASKS, methods=METHODS, budget=BUDGET, points=points)
+    hollow = [[line for line in axis.lines if line.get_markerfacecolor() == "none"] for axis in figure.axes]
+    (line,) = (line for line in hollow[0] if len(line.get_xdata()))
+    assert (list(line.get_xdata()), list(line.get_ydata())) == ([20_000, 40_000], [5.0, 7.0])
+    assert line.get_linestyle() == "None"
+    assert all(len(line.get_xdata()) == 0 for lines in hollow[1:] for line in lines)
+    assert "paper, quoted" in legend_colors(figure)
+
+
+def test_nothing_is_drawn_between_the_untrained_agent_and_the_first_evaluation():
+    table = estimates().query("env_steps == 0 or env_steps == 120_000")  # as baselines that begin after the budget
+    for axis in curves(table).axes:
+        assert drawn_lines(axis) == [] or all(len(line.get_xdata()) == 0 for line in drawn_lines(axis))
+        assert len(interval_corners(axis)) == 0
+        assert {tuple(line.get_xdata()) for line in drawn_markers(axis)} == {(0.0,)}
+
+
+def test_a_legend_of_many_long_names_fits_beside_panels_of_full_size():
+    names = [f"a method with a very long name {n}" for n in range(14)]
+    figure = curves(estimates(methods=names, tasks=TASKS[:1]), tasks=TASKS[:1], methods=names)
+    figure.canvas.draw()
+    assert figure.axes[0].get_window_extent().height > 150
+    (legend,) = figure.legends
+    assert legend.get_window_extent().width <= figure.bbox.width
+
+
 def test_a_curve_that_ends_early_is_not_drawn_further():
     axis = curves(estimates().query("env_steps <= 40_000")).axes[0]
     assert {line.get_xdata().max() for line in axis.lines} == {40_000}

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import re
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,6 +36,9 @@ FILES = {
 }
 # Evaluations at 0 and 100,000 env steps: the number of the seed with 00 and with 50 behind it.
 ROWS = "".join(f"{steps},{steps // 2},7,1.0,{{seed}}{steps // 2000:02d},0.5,10\n" for steps in (0, 100_000))
+
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+ENVIRONMENT |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
 
 
 def make_run(
@@ -95,13 +100,11 @@ def refused(run_main: Callable[..., None], capfd: pytest.CaptureFixture) -> Call
 
 def start(*arguments: str) -> subprocess.Popen[str]:
     """The command as a process of its own that can be interrupted, also where this one ignores interrupts."""
-    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with open("stdout", "w") as out, open("stderr", "w") as err:
             return subprocess.Popen(
-                [sys.executable, str(SCRIPT), *arguments], env=environment, stdout=out, stderr=err, text=True
+                [sys.executable, str(SCRIPT), *arguments], env=ENVIRONMENT, stdout=out, stderr=err, text=True
             )
     finally:
         signal.signal(signal.SIGINT, handler)
@@ -433,3 +436,133 @@ def test_the_home_directory_may_be_short(monkeypatch, tmp_path, run_main, capfd)
     make_run("my runs/a")
     run_main("~/my runs", "--out", "~/a report", "--reference")
     assert (tmp_path / "a report" / "index.md").is_file()
+
+
+def make_experiment(root: str = "runs/exp", *, seeds: tuple[int, ...] = (1, 2)) -> Path:
+    """Two variants of one preset on two tasks, whole; variant ``b`` is 10 above ``a`` at every evaluation but 0."""
+    for add, variant in ((0, "a"), (10, "b")):
+        for task in ("walker-walk", "cup-catch"):
+            for seed in seeds:
+                rows = [f"{t},{t // 2},7,1.0,{t and t // 1000 + seed + add},0,1" for t in (0, 10_000, 20_000, 50_000)]
+                make_run(
+                    f"{root}/{variant}/{task}/seed{seed}", task=task, seed=seed, text=HEADER + "\n".join([*rows, ""])
+                )
+    plan = {
+        "variants": {"a": {}, "b": {}},
+        "tasks": ["walker-walk", "cup-catch"],
+        "seeds": list(seeds),
+        "budget": 50_000,
+    }
+    Path(root, "experiment.yaml").write_text(json.dumps(plan))
+    return Path(root)
+
+
+def read_rows(name: str) -> list[dict[str, str]]:
+    with Path("report", name).open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_variants_of_an_experiment_are_compared_in_pairs_at_its_budget(run_main, capfd):
+    make_experiment()
+    run_main("runs")  # a folder above the experiment
+    out, err = capfd.readouterr()
+    assert err == ""
+    assert out.startswith(
+        "8 runs on 2 tasks of Easy DMC, up to 50,000 env steps, compared at 50,000, which all of them "
+    )
+    assert "missing" not in out
+    rows = {row["task"]: row for row in read_rows("paired.csv")}
+    assert {(row["variant"], row["base"]) for row in rows.values()} == {("b", "a")}
+    assert list(rows) == ["cup-catch", "walker-walk", "Normalized aggregate"]
+    for task in ("cup-catch", "walker-walk"):
+        assert [float(rows[task][name]) for name in ("pairs", "difference", "lower", "upper", "improvement")] == [
+            *(2, 10, 10, 10),
+            1,
+        ]
+    page = Path("report", "index.md").read_text()
+    assert "## Variants against a, paired by task and seed, at 50,000 environment steps" in page
+    assert "| b | a | cup-catch | +10.0 [+10.0, +10.0] | 1.00 [1.00, 1.00] | 2 | 0 |" in page
+    run_main("runs/exp", "--paired", "b")
+    assert [float(row["difference"]) for row in read_rows("paired.csv")][:2] == [-10, -10]
+
+
+def test_a_base_that_is_no_name_of_runs_is_refused(refused):
+    make_experiment()
+    assert refused("runs", "--paired", "c") == "--paired=c is no name of runs; choose one of a, b."
+
+
+def test_missing_and_unfinished_runs_are_named_on_the_page_and_in_the_line_and_shorten_nobody(run_main, capfd):
+    root = make_experiment()
+    shutil.rmtree(root / "b" / "cup-catch" / "seed2")
+    stopped = root / "a" / "walker-walk" / "seed1"
+    (stopped / "summary.json").unlink()
+    (stopped / "eval.csv").write_text(HEADER + "0,0,7,1.0,3,0.5,10\n10000,5000,7,1.0,11,0.5,10\n")
+    run_main("runs/exp")
+    named = (
+        "a on walker-walk with seed 1: not finished, ends at 10,000 env steps",
+        "b on cup-catch with seed 2: no run",
+    )
+    out = capfd.readouterr().out
+    assert "compared at 50,000, the budget of the experiment (the benchmark's budget is 200,000)" in out
+    assert f"; 2 missing or unfinished ({'; '.join(named)}); the report is" in out
+    page = Path("report", "index.md").read_text()
+    assert "## Missing and unfinished runs\n\n" + "".join(f"- {line}\n" for line in named) in page
+    assert float(read_table(Path("report", "final.csv"))["walker-walk"]["a"]) == 52  # of the seed that is there
+    assert [(row["pairs"], row["left_out"]) for row in read_rows("paired.csv")] == [("1", "1"), ("1", "1"), ("2", "2")]
+
+
+def test_a_part_of_an_experiment_misses_nothing_of_the_rest_and_a_bad_plan_is_one_line(run_main, capfd):
+    root = make_experiment()
+    run_main("runs/exp/b")
+    assert "missing" not in capfd.readouterr().out
+    assert "b" in read_table(Path("report", "final.csv"))["walker-walk"]
+    (root / "experiment.yaml").write_text("variants:")
+    run_main("runs/exp")
+    out, err = capfd.readouterr()
+    assert out.startswith("8 runs on 2 tasks")
+    (line,) = err.splitlines()
+    assert line.startswith("runs/exp/experiment.yaml does not list variants, tasks, seeds and a budget")
+
+
+def test_a_report_at_low_budgets_holds_every_baseline_that_was_evaluated_there_and_no_other(run_main, capfd):
+    make_experiment()
+    run_main("runs")
+    rows = {(row["method"], row["env_steps"], row["task"]): row for row in read_rows("returns.csv")}
+    assert rows["DR.Q", "50000", "walker-walk"]["kind"] == "evaluated"
+    assert rows["TD-MPC", "50000", "walker-walk"]["kind"] == "interpolated"
+    quoted = rows["EfficientZero V2", "50000", "walker-walk"]
+    assert (quoted["kind"], quoted["mean"], quoted["seeds"]) == ("quoted", "847", "")
+    assert "read off a figure" in quoted["source"]
+    assert ("DR.Q", "20000", "walker-walk") not in rows
+    assert not {"BMPC", "TD-MPC2", "SAC"} & {method for method, *_ in rows}
+    assert {"20000", "50000"} == {step for _, step, _ in rows}  # 100,000 is beyond the budget
+    page = Path("report", "index.md").read_text()
+    assert re.search(r"^- FoG: .*the unit of its steps is unverified$", page, re.M)
+    assert "nan" not in page.lower()
+
+
+def test_quoted_points_of_ones_own_are_read_and_refused_without_a_source(run_main, refused, capfd):
+    make_experiment()
+    Path("mine.csv").write_text("method,task,env_steps,mean,source\ntheirs,cup-catch,20000,5,a talk\n")
+    run_main("runs", "--reference", "--points", "mine.csv", "--out", "own")
+    capfd.readouterr()
+    assert "- theirs: a talk" in Path("own", "index.md").read_text()
+    Path("mine.csv").write_text("method,task,env_steps,mean,source\na,cup-catch,20000,5,a talk\n")
+    assert refused("runs", "--points", "mine.csv").startswith("a names both runs and a baseline")
+    Path("mine.csv").write_text("method,task,env_steps,mean,source\ntheirs,cup-catch,20000,5,\n")
+    assert refused("runs", "--points", "mine.csv").startswith("mine.csv: every point needs a source")
+    assert refused("runs", "--points", "no.csv") == "no such file of quoted points: no.csv."
+
+
+def test_baselines_of_ones_own_stand_without_the_quoted_points_of_others(run_main):
+    make_experiment()
+    run_main("runs", "--reference", make_baseline())
+    assert {row["method"] for row in read_rows("returns.csv")} == {"a", "b", "BMPC"}
+
+
+@pytest.mark.slow
+def test_a_thousand_runs_have_a_report_in_less_than_a_minute():
+    name = ROOT / "benchmarks" / "many_runs.py"
+    process = subprocess.run([sys.executable, str(name)], capture_output=True, text=True, env=ENVIRONMENT, check=True)
+    (seconds,) = re.findall(r"^1008 runs: ([\d.]+) s;", process.stdout, re.M)
+    assert float(seconds) < 60

@@ -312,10 +312,10 @@ def _check_units(table: pd.DataFrame, file: Path) -> None:
     if "decision_steps" not in table:
         return
     _numbers(table, ["decision_steps"], file)
-    repeat = table["task"].map(_ACTION_REPEAT)
-    wrong = table[repeat.notna() & (table["env_steps"] != table["decision_steps"] * repeat)]
-    if len(wrong):
-        row = wrong.iloc[0]
+    repeat = np.array([_ACTION_REPEAT.get(task, np.nan) for task in table["task"]])
+    wrong = ~np.isnan(repeat) & (table["env_steps"].to_numpy() != table["decision_steps"].to_numpy() * repeat)
+    if wrong.any():
+        row = table[wrong].iloc[0]
         raise ValueError(
             f"{file} mixes units: {row['env_steps']:.0f} env_steps beside {row['decision_steps']:.0f} decision_steps, "
             f"but {row['task']} has {_ACTION_REPEAT[row['task']]} env steps per decision; write environment steps."

@@ -127,9 +127,10 @@ def plot_curves(
     axes = figure.subplots(rows, columns, squeeze=False)
     styles = method_styles([*methods, *quoted])
     unclipped = {"clip_on": False, "in_layout": False}  # whole markers at the ends of the axis
+    found = dict(list(estimates.groupby(["task", "method"])))
     for place, (axis, task) in enumerate(zip(axes.flat, tasks, strict=False)):
         for method in methods:
-            curve = estimates[(estimates["task"] == task) & (estimates["method"] == method)]
+            curve = found.get((task, method), estimates.iloc[:0])
             _line(axis, curve, styles[method], budget)
             here = curve[curve["env_steps"] <= budget]
             axis.plot(

@@ -79,23 +79,33 @@ def interpolate(estimates: pd.DataFrame, grid: np.ndarray, *, from_zero: bool = 
     [5.0, nan, 20.0, 30.0, nan]
     """
     grid = np.asarray(grid, dtype=float)
-    tables = []
-    key = _curve_key(estimates)
-    for names, curve in estimates.groupby(key, sort=False):
-        curve = curve.sort_values("env_steps")
-        steps, seeds = curve["env_steps"].to_numpy(float), curve["seeds"].to_numpy(float)
-        untrained = (grid > 0) & (grid < steps[steps > 0].min(initial=np.inf)) & (not from_zero)
-        columns = {
-            name: np.where(untrained, np.nan, np.interp(grid, steps, curve[name], left=np.nan, right=np.nan))
-            for name in ("mean", "standard_error")
-        }
-        after = np.clip(np.searchsorted(steps, grid), 0, len(steps) - 1)
-        before = np.clip(np.searchsorted(steps, grid, side="right") - 1, 0, len(steps) - 1)
-        columns["seeds"] = np.where(np.isnan(columns["mean"]), np.nan, np.fmin(seeds[before], seeds[after]))
-        tables.append(pd.DataFrame({**dict(zip(key, names, strict=True)), "env_steps": grid, **columns}))
-    if not tables:
+    if not len(estimates):
         return estimates.iloc[:0]
-    return pd.concat(tables, ignore_index=True)
+    key = _curve_key(estimates)
+    curve = estimates.groupby(key, sort=False).ngroup().to_numpy()
+    order = np.lexsort((estimates["env_steps"], curve))
+    columns = [estimates[name].to_numpy(float)[order] for name in ("env_steps", "mean", "standard_error", "seeds")]
+    starts = np.flatnonzero(np.diff(curve[order], prepend=-1))
+    values = []
+    for rows in zip(*(np.split(column, starts[1:]) for column in columns), strict=True):
+        values.append(_on_grid(*rows, grid, from_zero))
+    table = estimates[key].iloc[np.repeat(order[starts], len(grid))].reset_index(drop=True)
+    mean, error, seeds = np.concatenate(values, axis=1)
+    return table.assign(env_steps=np.tile(grid, len(starts)), mean=mean, standard_error=error, seeds=seeds)
+
+
+def _on_grid(
+    steps: np.ndarray, mean: np.ndarray, error: np.ndarray, seeds: np.ndarray, grid: np.ndarray, from_zero: bool
+) -> np.ndarray:
+    """Mean, standard error and seeds of one curve, in the order of its steps, on the grid ``[3, len(grid)]``."""
+    untrained = (grid > 0) & (grid < steps[steps > 0].min(initial=np.inf)) & (not from_zero)
+    mean, error = (
+        np.where(untrained, np.nan, np.interp(grid, steps, values, left=np.nan, right=np.nan))
+        for values in (mean, error)
+    )
+    after = np.clip(np.searchsorted(steps, grid), 0, len(steps) - 1)
+    before = np.clip(np.searchsorted(steps, grid, side="right") - 1, 0, len(steps) - 1)
+    return np.stack([mean, error, np.where(np.isnan(mean), np.nan, np.fmin(seeds[before], seeds[after]))])
 
 
 def shared_grid(estimates: pd.DataFrame, budget: float, step: float, *, start: float | None = None) -> np.ndarray:

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("pandas")
+pytest.importorskip("scipy")
+
+import yaml  # noqa: E402
+
+from torchrl_etdmpc.analysis import Run, experiment_root, find_runs, incomplete_runs, read_experiment  # noqa: E402
+
+PLAN = {"variants": ["a", "b"], "tasks": ["walker-walk"], "seeds": [1, 2], "budget": 100}
+
+
+def make_run(
+    root: Path, variant: str, seed: int, *, last: int = 100, finished: bool = True, task="walker-walk"
+) -> Path:
+    run = root / variant / task / f"seed{seed}"
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(yaml.safe_dump({"task": task, "preset": "cpu", "seed": seed}))
+    rows = [f"{step},{seed}" for step in range(0, last + 1, 50)] if last >= 0 else []
+    (run / "eval.csv").write_text("\n".join(["env_steps,return_mean", *rows, ""]))
+    if finished:
+        (run / "summary.json").write_text(json.dumps({}))
+    return run
+
+
+def read(root: Path) -> list[Run]:
+    return [Run.read(path, method=path.relative_to(root).parts[0]) for path in find_runs([root])]
+
+
+def plan(root: Path, **changes) -> Path:
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "experiment.yaml").write_text(yaml.safe_dump(PLAN | changes))
+    return root
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    for variant in "ab":
+        for seed in (1, 2):
+            make_run(tmp_path, variant, seed)
+    return plan(tmp_path)
+
+
+def test_a_whole_experiment_has_nothing_to_name(whole):
+    assert incomplete_runs(read(whole), [read_experiment(whole)]) == []
+    assert incomplete_runs(read(whole)) == []
+
+
+def test_missing_runs_of_an_experiment_are_named(whole):
+    root = plan(whole, variants={"a": {}, "b": {"seed": 3}, "c": None}, seeds=[1, 2, 3])
+    expected = [("a", 3), ("b", 3), ("c", 1), ("c", 2), ("c", 3)]
+    lines = incomplete_runs(read(root), [read_experiment(root)])
+    assert lines == [f"{variant} on walker-walk with seed {seed}: no run" for variant, seed in expected]
+
+
+def test_unfinished_runs_and_those_that_end_early_are_named(tmp_path):
+    make_run(tmp_path, "a", 1)
+    make_run(tmp_path, "a", 2, last=50)
+    make_run(tmp_path, "b", 1, finished=False, last=50)
+    make_run(tmp_path, "b", 2, finished=False, last=-1)
+    others = [
+        "a on walker-walk with seed 2: ends at 50 env steps, others at 100",
+        "b on walker-walk with seed 1: not finished, ends at 50 env steps",
+        "b on walker-walk with seed 2: not finished, has no evaluation",
+    ]
+    assert incomplete_runs(read(tmp_path)) == others
+    root = plan(tmp_path, budget=200)
+    lines = incomplete_runs(read(root), [read_experiment(root)])
+    assert lines[0] == "a on walker-walk with seed 1: ends at 100 env steps, its budget is 200"
+    assert len(lines) == 4
+
+
+def test_without_a_plan_a_seed_that_another_method_has_on_the_task_is_missed(tmp_path):
+    for variant, seed in (("a", 1), ("a", 2), ("b", 1)):
+        make_run(tmp_path, variant, seed)
+    make_run(tmp_path, "a", 1, task="walker-run")  # b was not run on it at all
+    assert incomplete_runs(read(tmp_path)) == ["b on walker-walk with seed 2: no run"]
+
+
+def test_methods_without_a_shared_seed_miss_nothing(tmp_path):
+    make_run(tmp_path, "a", 1)
+    make_run(tmp_path, "b", 2)
+    assert incomplete_runs(read(tmp_path)) == []
+
+
+def test_the_root_is_found_from_a_run_whose_task_has_a_slash(tmp_path):
+    root = plan(tmp_path / "exp")
+    assert experiment_root(make_run(root, "a", 1, task="gym/Pendulum-v1")) == root
+    assert experiment_root(make_run(tmp_path / "other", "a", 1)) is None
+
+
+def test_a_set_of_tasks_may_be_named(tmp_path):
+    assert len(read_experiment(plan(tmp_path, tasks="dmc-easy")).tasks) == 21
+    assert read_experiment(plan(tmp_path, budget=None)).budget is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[", "variants: 3\n", "\0\1", "- a\n", *(yaml.safe_dump(PLAN | {key: None}) for key in ("tasks", "seeds"))]
+    + [yaml.safe_dump(PLAN | change) for change in ({"seeds": ["1"]}, {"tasks": []}, {"budget": -1}, {"tasks": "x"})],
+)
+def test_a_plan_that_is_none_is_one_line(tmp_path, text):
+    (tmp_path / "experiment.yaml").write_text(text)
+    with pytest.raises(
+        ValueError, match=r"experiment\.yaml does not list variants, tasks, seeds and a budget"
+    ) as caught:
+        read_experiment(tmp_path)
+    assert len(str(caught.value).splitlines()) == 1
