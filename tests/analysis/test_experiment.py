@@ -100,6 +100,28 @@ def test_a_set_of_tasks_may_be_named(tmp_path):
     assert read_experiment(plan(tmp_path, budget=None)).budget is None
 
 
+def test_the_budget_may_be_the_benchmark_s_and_the_base_is_read(tmp_path):
+    found = read_experiment(plan(tmp_path, budget="benchmark", base="b"))
+    assert (found.env_steps("walker-walk"), found.env_steps("dog-run"), found.env_steps("mine")) == (
+        200_000,
+        600_000,
+        None,
+    )
+    assert found.base == "b"
+
+
+def test_a_plan_that_a_suite_wrote_is_read(tmp_path):
+    from torchrl_etdmpc.suites import Experiment, write_experiment
+
+    written = Experiment(
+        "e", ("walker-walk", "gym/Pendulum-v1"), (1, 2), {"a": {}, "b": {"planner.horizon": 4}}, base="b"
+    )
+    write_experiment(written, tmp_path / "experiment.yaml")
+    found = read_experiment(tmp_path)
+    assert (found.variants, found.tasks, found.seeds) == (tuple(written.variants), written.tasks, written.seeds)
+    assert (found.budget, found.base) == (None, "b")
+
+
 @pytest.mark.parametrize(
     "text",
     ["", "[", "variants: 3\n", "\0\1", "- a\n", *(yaml.safe_dump(PLAN | {key: None}) for key in ("tasks", "seeds"))]

@@ -482,6 +482,12 @@ def test_variants_of_an_experiment_are_compared_in_pairs_at_its_budget(run_main,
     page = Path("report", "index.md").read_text()
     assert "## Variants against a, paired by task and seed, at 50,000 environment steps" in page
     assert "| b | a | cup-catch | +10.0 [+10.0, +10.0] | 1.00 [1.00, 1.00] | 2 | 0 |" in page
+    plan = Path("runs", "exp", "experiment.yaml")
+    plan.write_text(json.dumps({**json.loads(plan.read_text()), "base": "b"}))
+    run_main("runs/exp")
+    assert [row["base"] for row in read_rows("paired.csv")] == ["b"] * 3
+    run_main("runs/exp", "--paired", "a")
+    assert [row["base"] for row in read_rows("paired.csv")] == ["a"] * 3
     run_main("runs/exp", "--paired", "b")
     assert [float(row["difference"]) for row in read_rows("paired.csv")][:2] == [-10, -10]
 

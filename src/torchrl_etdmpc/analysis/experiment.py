@@ -24,7 +24,8 @@ class Experiment:
         variants (tuple of str): names of its folders.
         tasks (tuple of str): task names.
         seeds (tuple of int): seeds.
-        budget (int, optional): env steps of every run.
+        budget (int, optional): env steps of every run. Default: those of the benchmark that a task belongs to.
+        base (str, optional): the variant that the others are compared with.
     """
 
     root: Path
@@ -32,10 +33,17 @@ class Experiment:
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     budget: int | None = None
+    base: str | None = None
+
+    def env_steps(self, task: str) -> int | None:
+        """How long a run on the task is to be, if that is known."""
+        if self.budget is not None:
+            return self.budget
+        return next((benchmark.budget for benchmark in BENCHMARKS.values() if task in benchmark.tasks), None)
 
 
 def read_experiment(root: Path) -> Experiment:
-    """Reads ``experiment.yaml``: ``variants`` (names, or a mapping by name), ``tasks``, ``seeds``, ``budget``.
+    """Reads ``variants`` (names, or a mapping by name), ``tasks``, ``seeds``, ``budget`` and ``base`` of a folder.
 
     Args:
         root (Path): the folder that holds it.
@@ -52,14 +60,15 @@ def read_experiment(root: Path) -> Experiment:
         for name, (items, kind) in lists.items():
             if not isinstance(items, list | tuple) or not items or not all(isinstance(item, kind) for item in items):
                 raise ValueError(name)
-        budget = values.get("budget")
+        budget = None if values.get("budget") == "benchmark" else values.get("budget")
         if not (budget is None or isinstance(budget, int) and budget > 0):
             raise ValueError("budget")
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
         raise ValueError(
             f"{file} does not list variants, tasks, seeds and a budget, so that nobody can say which runs are missing."
         ) from error
-    return Experiment(root, *(tuple(items) for items, _ in lists.values()), budget=budget)
+    variants, tasks, seeds = (tuple(items) for items, _ in lists.values())
+    return Experiment(root, variants, tasks, seeds, budget, values.get("base"))
 
 
 def experiment_root(run: Path) -> Path | None:
@@ -101,7 +110,7 @@ def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[
     for run in runs:
         longest[run.task] = max(longest.get(run.task, 0.0), run.last)  # a NaN is never the larger one
     for run in runs:
-        budget = next((plan.budget for plan in experiments if plan.root in run.path.parents), None)
+        budget = next((plan.env_steps(run.task) for plan in experiments if plan.root in run.path.parents), None)
         target = budget or longest[run.task]
         where = f"{run.method} on {run.task} with seed {run.seed}"
         ends = f"ends at {run.last:,.0f} env steps" if run.last >= 0 else "has no evaluation"

@@ -55,7 +55,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--paired",
         metavar="BASE",
-        help="compares the others with BASE, paired by task and seed (default: the first, where runs share any)",
+        help="compares the others with BASE, paired by task and seed (default: the experiment's, or the first name)",
     )
     parser.add_argument("--out", default="report", help="folder of the report (default: report)")
     parser.add_argument("--all-tasks", action="store_true", help="all tasks of the benchmark, not only those with runs")
@@ -134,7 +134,8 @@ def choose_budget(
 
     last = runs.groupby(["method", "task", "seed"])["env_steps"].max()
     reached = int(last.min())
-    planned = {plan.budget for plan in experiments if plan.budget and plan.budget <= last.max()}
+    planned = {plan.env_steps(task) for plan in experiments for task in plan.tasks if task in set(runs["task"])}
+    planned = {budget for budget in planned if budget and budget <= last.max()}
     step = None
     if arguments.budget or (reached >= benchmark.budget and benchmark.name in BENCHMARKS):
         budget, step = arguments.budget or benchmark.budget, DEFAULT_GRID_STEP
@@ -225,7 +226,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         grid_step=grid_step,
         start=arguments.grid_start or int(-(-first // grid_step) * grid_step),
         points=points,
-        **choose_base(arguments, chosen, methods),
+        **choose_base(arguments, chosen, methods, experiments),
     )
     incomplete = incomplete_runs(found, experiments)
     page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector, incomplete=incomplete)
@@ -260,16 +261,18 @@ def refuse_clash(methods: list[str], tables: list[Table]) -> None:
         raise ValueError(f"{clash[0]} names both runs and a baseline; give the runs another name (NAME=PATH).")
 
 
-def choose_base(arguments: argparse.Namespace, runs: Table, methods: list[str]) -> dict[str, Any]:
+def choose_base(
+    arguments: argparse.Namespace, runs: Table, methods: list[str], experiments: list[Experiment]
+) -> dict[str, Any]:
     """The base and the variants that are compared with it, if there are any.
 
     Raises:
         ValueError: if no run has the name that was asked for.
     """
     if arguments.paired is None:
-        base = methods[0]
+        base = next((plan.base for plan in experiments if plan.base in methods), methods[0])
         keys = {name: set(zip(rows["task"], rows["seed"], strict=True)) for name, rows in runs.groupby("method")}
-        variants = [name for name in methods[1:] if keys[name] & keys[base]]
+        variants = [name for name in methods if name != base and keys[name] & keys[base]]
     elif arguments.paired in methods:
         base = arguments.paired
         variants = [name for name in methods if name != base]
