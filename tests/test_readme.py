@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import runpy
 import shlex
@@ -182,3 +183,18 @@ def test_the_columns_that_the_docs_name_are_those_of_a_run():
     from torchrl_etdmpc.runs import EVAL_COLUMNS
 
     assert [column for column in EVAL_COLUMNS if f"`{column}`" not in TEXTS["docs/running.md"]] == []
+
+
+def test_the_returns_that_the_pages_compare_are_those_of_the_committed_report():
+    with open(ROOT / "benchmarks" / "results" / "cpu" / "report" / "returns.csv", newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["env_steps"] == "50000" and row["task"] == "Mean over tasks"]
+    found = {row["method"]: f"{float(row['mean']):.0f}" for row in rows if row["tasks"] == "6"}
+    names = {"TD-MPC2": "TD-MPC2 (EZ-V2's figure)", "this": "cpu", "this, `cpu`": "cpu"}
+    caption = re.search(
+        r"Mean return of the six tasks at 50,000 env steps: (.*?) if it counts", TEXTS["README.md"], re.S
+    )[1]
+    quoted = re.findall(r"([A-Z][\w.-]+(?: V2)?|this) (\d{3})\b", caption)
+    table = re.findall(r"^\| ([^|]+) \| (\d{3})\b(?! and)", TEXTS["docs/results.md"], re.M)
+    assert len(quoted) == 6 and len(table) == 8
+    for method, value in (*quoted, *table):
+        assert value == found[{**names, "DreamerV3": "DreamerV3 (author)"}.get(method, method)], method

@@ -21,7 +21,7 @@ from torchrl_etdmpc.analysis.benchmarks import (
     get_benchmark,
     own_benchmark,
 )
-from torchrl_etdmpc.analysis.comparison import Comparison, begins, compare, merge_estimates
+from torchrl_etdmpc.analysis.comparison import Comparison, begins, compare, evaluated_methods, merge_estimates
 from torchrl_etdmpc.analysis.curves import (
     Run,
     find_runs,
@@ -74,6 +74,7 @@ __all__ = [
     "compare",
     "compare_paired",
     "estimate",
+    "evaluated_methods",
     "experiment_root",
     "find_runs",
     "get_benchmark",

@@ -152,6 +152,22 @@ def compare(
     return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **tables)
 
 
+def evaluated_methods(
+    seed_curves: pd.DataFrame, means: pd.DataFrame, *, tasks: Sequence[str], budget: float
+) -> list[str]:
+    """The methods with an evaluation of the trained agent up to the budget on one of the tasks; published means first.
+
+    Args:
+        seed_curves (DataFrame): of the runs, and of baselines that are published per seed.
+        means (DataFrame): estimates of baselines that are published as means.
+        tasks (sequence of str): the compared tasks.
+        budget (float): env steps.
+    """
+    first = begins(merge_estimates(seed_curves, means)).reset_index()
+    here = set(first[first["task"].isin(tasks) & (first["env_steps"] <= budget)]["method"])
+    return [name for name in dict.fromkeys([*means["method"], *seed_curves["method"]]) if name in here]
+
+
 def begins(curves: pd.DataFrame) -> pd.Series:
     """The first evaluation of the trained agent by method and task, those at 0 env steps apart.
 

@@ -89,13 +89,13 @@ def named(argument: str) -> tuple[str | None, str]:
     return None, os.path.expanduser(argument)
 
 
-def read(arguments: argparse.Namespace) -> tuple[list[Run], list[Experiment], list[str]]:
-    """The runs, the experiments that are read whole, and a line for each run or experiment that cannot be read.
+def read(arguments: argparse.Namespace) -> tuple[list[Run], Table, list[Experiment], list[str]]:
+    """The runs, their seed curves, the experiments that are read whole, and a line for whatever cannot be read.
 
     Raises:
         ValueError, OSError: if there is no other run.
     """
-    from torchrl_etdmpc.analysis import Run, experiment_root, find_runs, read_experiment
+    from torchrl_etdmpc.analysis import Run, experiment_root, find_runs, join_runs, read_experiment
 
     runs: list[Run] = []
     broken: dict[Path, Exception] = {}
@@ -119,7 +119,7 @@ def read(arguments: argparse.Namespace) -> tuple[list[Run], list[Experiment], li
             experiments.append(read_experiment(root))
         except ValueError as error:
             lines.append(str(error))
-    return runs, experiments, lines
+    return runs, join_runs(runs), experiments, lines
 
 
 def choose_budget(
@@ -181,18 +181,9 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     """Writes the report; returns a line for the terminal."""
     import pandas as pd
 
-    from torchrl_etdmpc.analysis import (
-        begins,
-        compare,
-        incomplete_runs,
-        join_curves,
-        join_runs,
-        merge_estimates,
-        write_report,
-    )
+    from torchrl_etdmpc.analysis import compare, evaluated_methods, incomplete_runs, join_curves, write_report
 
-    found, experiments, lines = read(arguments)
-    runs = join_runs(found)
+    found, runs, experiments, lines = read(arguments)
     for line in lines:
         print(line, file=sys.stderr, flush=True)
     if runs.empty:
@@ -212,9 +203,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     refuse_clash(methods, [*means, *seeds[1:], points])
     curves = join_curves(seeds)
     published = join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"])
-    here = begins(merge_estimates(curves, published)).reset_index()
-    here = set(here[here["task"].isin(tasks) & (here["env_steps"] <= budget)]["method"])
-    baselines = [name for name in dict.fromkeys([*published["method"], *curves["method"]]) if name in here]
+    baselines = evaluated_methods(curves, published, tasks=tasks, budget=budget)
     first = chosen.groupby("method")["env_steps"].min().max()
     comparison = compare(
         curves,
