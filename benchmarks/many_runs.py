@@ -79,10 +79,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "experiment"
         count = make_experiment(root, variants=arguments.variants, tasks=arguments.tasks, seeds=arguments.seeds)
+        before = time.process_time()
         seconds, line, profile = measure(root, Path(folder) / "report", profiled=arguments.profile)
+        cpu = time.process_time() - before
     assert line.startswith(f"{count} runs on {arguments.tasks} tasks"), line
     print(profile)
-    print(f"{count} runs: {seconds:.1f} s; {line}")
+    print(f"{count} runs: {seconds:.1f} s, {cpu:.1f} s of the processor; {line}")
 
 
 if __name__ == "__main__":

@@ -483,9 +483,10 @@ def test_variants_of_an_experiment_are_compared_in_pairs_at_its_budget(run_main,
     assert "## Variants against a, paired by task and seed, at 50,000 environment steps" in page
     assert "| b | a | cup-catch | +10.0 [+10.0, +10.0] | 1.00 [1.00, 1.00] | 2 | 0 |" in page
     plan = Path("runs", "exp", "experiment.yaml")
-    plan.write_text(json.dumps({**json.loads(plan.read_text()), "base": "b"}))
+    plan.write_text(json.dumps({**json.loads(plan.read_text()), "base": "b", "variants": {"b": {}, "a": {}}}))
     run_main("runs/exp")
     assert [row["base"] for row in read_rows("paired.csv")] == ["b"] * 3
+    assert Path("report", "auc.md").read_text().startswith("| task | b | a |")  # in the order of the plan
     run_main("runs/exp", "--paired", "a")
     assert [row["base"] for row in read_rows("paired.csv")] == ["a"] * 3
     run_main("runs/exp", "--paired", "b")
@@ -570,5 +571,6 @@ def test_baselines_of_ones_own_stand_without_the_quoted_points_of_others(run_mai
 def test_a_thousand_runs_have_a_report_in_less_than_a_minute():
     name = ROOT / "benchmarks" / "many_runs.py"
     process = subprocess.run([sys.executable, str(name)], capture_output=True, text=True, env=ENVIRONMENT, check=True)
-    (seconds,) = re.findall(r"^1008 runs: ([\d.]+) s;", process.stdout, re.M)
+    # of the processor, on which other work may run beside
+    (seconds,) = re.findall(r"^1008 runs: [\d.]+ s, ([\d.]+) s of the processor;", process.stdout, re.M)
     assert float(seconds) < 60

@@ -194,7 +194,8 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     chosen = runs[runs["task"].isin(tasks)]
     if chosen.empty:
         raise ValueError(f"no run on a task of {benchmark.name}; the runs are on {', '.join(present)}.")
-    methods = list(dict.fromkeys(chosen["method"]))
+    planned = dict.fromkeys(variant for plan in experiments for variant in plan.variants)  # in their own order
+    methods = [name for name in dict.fromkeys([*planned, *chosen["method"]]) if name in set(chosen["method"])]
     budget, grid_step = choose_budget(arguments, benchmark, chosen, experiments)
     seeds, means = [chosen], []
     for table in references:
