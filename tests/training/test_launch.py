@@ -390,6 +390,22 @@ def test_a_signal_before_the_first_step_leaves_nothing_behind(command, tmp_path,
 
 
 @needs_dm_control
+def test_a_library_that_makes_another_error_of_a_signal_does_not_hide_it(command, tmp_path, monkeypatch, process):
+    """Seen in one of some 200 kills: tensordict, interrupted while it was built, complained of something else."""
+
+    def interrupted(*args: Any, **options: Any) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except SystemExit:
+            raise RuntimeError("Converting a tensordict to boolean value is not permitted") from None
+
+    monkeypatch.setattr(TrainingRun, "precompile", interrupted)
+    with pytest.raises(RunInterrupted, match=r"^stopped before the first step, with nothing to save; start it ag"):
+        launch(command())
+    assert not (tmp_path / "run").exists()
+
+
+@needs_dm_control
 def test_an_error_before_the_first_step_leaves_nothing_behind(command, tmp_path, monkeypatch, process):
     def fail(*_: Any, **__: Any) -> None:
         raise RuntimeError("this machine has no compiler")

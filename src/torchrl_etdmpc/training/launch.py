@@ -107,8 +107,10 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
     with StopSignals() as stop:
         try:
             summary = _train(plan, stop)
-        except SystemExit:
-            if not stop.requested:
+        except (SystemExit, Exception):
+            # The signal raises SystemExit wherever the program is; a library that it interrupts may make another error
+            # of it.
+            if not (stop.requested and stop.nothing_to_save):
                 raise
             state = "with nothing to save" if plan.action == "begin" else f"{plan.directory} goes on from where it was"
             raise RunInterrupted(f"stopped before the first step, {state}; start it again.") from None
