@@ -26,6 +26,8 @@ TRAJECTORY = ("collector", "traj_ids")
 """``[...]`` int64: which episode a row belongs to, as TorchRL's collectors number them."""
 ENV_INDEX = "env_index"
 """``[...]`` int64: which environment a row is of, as TorchRL's ``AsyncBatchedCollector`` writes it."""
+WORKER = "worker"
+"""``[...]`` int64: which worker a row is of, where workers number their episodes each from 0."""
 MASK = ("collector", "mask")
 """``[...]`` bool: false where a row is padding, as TorchRL's collectors write it with ``split_trajs=True``."""
 

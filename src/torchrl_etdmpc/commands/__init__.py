@@ -1,4 +1,4 @@
-"""The commands ``torchrl-etdmpc train|evaluate|export|report|suite``; the scripts in ``examples/`` run the same."""
+"""The commands of ``torchrl-etdmpc``, e.g. ``torchrl-etdmpc train``; the scripts in ``examples/`` run the same ones."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ __all__ = ["main"]
 
 _COMMANDS = {
     "train": "trains an agent on any task",
+    "distributed": "trains with workers that plan and step, on one machine or a cluster",
     "evaluate": "plays episodes with a trained agent, and films them",
     "export": "writes an agent as programs that need PyTorch only",
     "report": "compares runs with each other and with published baselines",
@@ -27,8 +28,8 @@ def main(command: str | None = None) -> None:
     looks for a renderer when it is imported, is told whether there will be anything to render.
 
     Args:
-        command (str, optional): ``"train"``, ``"train_dmc"``, ``"evaluate"``, ``"export"``, ``"report"``, ``"suite"``.
-            Default: the first argument.
+        command (str, optional): ``"train"``, ``"train_dmc"``, ``"distributed"``, ``"evaluate"``, ``"export"``,
+            ``"report"`` or ``"suite"``. Default: the first argument.
     """
     if command is None:
         command = _first_argument()
@@ -52,7 +53,7 @@ def main(command: str | None = None) -> None:
 
 
 def _first_argument() -> str:
-    lines = "".join(f"  {name:9} {meaning}\n" for name, meaning in _COMMANDS.items())
+    lines = "".join(f"  {name:11} {meaning}\n" for name, meaning in _COMMANDS.items())
     usage = (
         f"usage: torchrl-etdmpc COMMAND ...\n\n{lines}\n"
         "torchrl-etdmpc COMMAND --help says what a command takes, torchrl-etdmpc --version which version this is."

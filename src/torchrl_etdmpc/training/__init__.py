@@ -11,6 +11,7 @@ from torchrl_etdmpc.training.builders import (
     row_bytes,
 )
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig, config_from_dict
+from torchrl_etdmpc.training.distributed import DistributedConfig, WorkerCollector
 from torchrl_etdmpc.training.estimate import estimated_seconds, what_it_takes
 from torchrl_etdmpc.training.evaluator import EvaluationResult, Evaluator
 from torchrl_etdmpc.training.launch import (
@@ -41,6 +42,7 @@ __all__ = [
     "AgentFile",
     "BestAgent",
     "CheckpointError",
+    "DistributedConfig",
     "EvaluationResult",
     "Evaluator",
     "Launch",
@@ -50,6 +52,7 @@ __all__ = [
     "TrainingRun",
     "UpdateStepper",
     "Updater",
+    "WorkerCollector",
     "build_agent",
     "build_collector",
     "build_planner",

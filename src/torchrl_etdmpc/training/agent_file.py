@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Mapping
@@ -50,9 +51,10 @@ class AgentFile:
 
     def state_dict(self) -> dict[str, Any]:
         """The content of the file."""
+        settings = self.config.to_dict()
         return {
             "format": FORMAT,
-            "config": self.config.to_dict(),
+            "config": {field.name: settings[field.name] for field in dataclasses.fields(TrainConfig)},  # not of workers
             "observation_dim": self.agent.world_model.observation_dim,
             "action_dim": self.agent.world_model.action_dim,
             "counters": dict(self.counters()),

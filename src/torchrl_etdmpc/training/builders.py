@@ -7,9 +7,11 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRo
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import SeedPolicy, StepCollector
+from torchrl_etdmpc.keys import TRAJECTORY, WORKER
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig, named_settings
+from torchrl_etdmpc.training.distributed import DistributedConfig, WorkerCollector
 
 # What an environment or a policy writes and nothing reads from a stored row: less to write at every step.
 UNREAD = (
@@ -75,6 +77,7 @@ def build_replay(
     with named_settings("loss", config.loss):
         sampler = StepSliceSampler(
             config.loss.slice_len,
+            traj_key=[WORKER, TRAJECTORY] if isinstance(config, DistributedConfig) else TRAJECTORY,
             uniform_over=config.replay.uniform_over,
             partial=config.replay.partial,
             as_slices=True,
@@ -103,8 +106,12 @@ def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayB
     return reanalyze.attach(replay)
 
 
-def build_collector(config: TrainConfig, agent: Agent, env: EnvBase, replay: TensorDictReplayBuffer) -> StepCollector:
-    """The collector with its random phase, on an environment with ``config.num_envs`` rows."""
+def build_collector(
+    config: TrainConfig, agent: Agent, env: EnvBase, replay: TensorDictReplayBuffer
+) -> StepCollector | WorkerCollector:
+    """The collector with its random phase: on an environment with ``config.num_envs`` rows, or workers."""
+    if isinstance(config, DistributedConfig):
+        return WorkerCollector(config, agent, env, replay, exclude_keys=UNREAD)
     return StepCollector(
         env,
         agent.planner,

@@ -310,6 +310,11 @@ class TrainConfig:
         return self.seed_decisions if self.replay.pretrain_updates is None else self.replay.pretrain_updates
 
     @property
+    def decisions_per_step(self) -> int:
+        """Decisions that come together."""
+        return self.num_envs
+
+    @property
     def total_decisions(self) -> int:
         """The budget in decisions, all environments together."""
         return -(-self.total_env_steps // self.task_spec.action_repeat)

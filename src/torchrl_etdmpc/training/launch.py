@@ -18,6 +18,7 @@ from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logge
 from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
+from torchrl_etdmpc.training.distributed import DistributedConfig, is_distributed
 from torchrl_etdmpc.training.estimate import what_it_takes
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.train import TrainingRun
@@ -33,6 +34,9 @@ CHANGEABLE = {
     "checkpoint_every",
     "checkpoint_minutes",
     "checkpoint_keep",
+    "workers",
+    "engine",
+    "address",
 }
 
 
@@ -70,7 +74,7 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
     if directory.leftover or config.resume == "off" or (config.resume == "auto" and not there):
         directory.require_new()
         return Launch(config, directory, "begin")
-    stored = read_run_config(directory)
+    stored = read_run_config(directory, type(config))
     merged = resumed_config(stored, config, explicit)
     if directory.finished and merged.total_env_steps <= stored.total_env_steps:
         return Launch(merged, directory, "nothing")
@@ -155,8 +159,12 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
             raise
 
 
-def read_run_config(directory: RunDirectory) -> TrainConfig:
+def read_run_config(directory: RunDirectory, kind: type[TrainConfig] = TrainConfig) -> TrainConfig:
     """The configuration in a run directory; if that file is damaged, what its newest weights were trained with.
+
+    Args:
+        directory (RunDirectory): of the run.
+        kind (type): of configuration. Default: :class:`TrainConfig`.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -170,18 +178,26 @@ def read_run_config(directory: RunDirectory) -> TrainConfig:
         except CheckpointError:
             raise error from None
         warnings.warn(f"{str(error).rstrip('.')}; the settings are those of {directory.last_agent}.", stacklevel=2)
+    else:
+        by_workers = is_distributed(values)
+        if by_workers != issubclass(kind, DistributedConfig):
+            who, command = ("workers", "distributed") if by_workers else ("one process", "train")
+            raise ValueError(f"{directory} is a run of {who}; go on with the command {command}, or start a new run_dir.")
     try:
-        return TrainConfig.from_dict(values)
+        return kind.from_dict(values)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{directory.config} cannot be used: {error}") from error
 
 
-def with_stored_settings(values: Mapping[str, Any], explicit: Iterable[str] = ()) -> dict[str, Any]:
+def with_stored_settings(
+    values: Mapping[str, Any], explicit: Iterable[str] = (), kind: type[TrainConfig] = TrainConfig
+) -> dict[str, Any]:
     """The settings of a command that goes on with a run: what it does not name is the run's, not the preset's.
 
     Args:
         values (mapping): the command's settings, not checked yet.
         explicit (iterable of str): those that it names.
+        kind (type): of configuration. Default: :class:`TrainConfig`.
 
     Returns:
         dict: ``values``, if no run is to go on.
@@ -193,7 +209,7 @@ def with_stored_settings(values: Mapping[str, Any], explicit: Iterable[str] = ()
     there = directory.config.exists() or directory.last_agent.exists()
     if resume in (False, "off", "false") or directory.leftover or not there:
         return dict(values)
-    return resumed_config(read_run_config(directory), values, explicit).to_dict()
+    return resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
 
 
 def _directory(values: Mapping[str, Any]) -> RunDirectory:
@@ -224,7 +240,7 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
                 f"{_typed(name)}={wanted.get(name)} was asked for, but this run was started with "
                 f"{_typed(name)}={values.get(name)}; leave it out to go on, or start a new run_dir."
             )
-    return TrainConfig.from_dict(_nested(values))
+    return type(saved).from_dict(_nested(values))
 
 
 def _typed(name: str) -> str:

@@ -20,6 +20,7 @@ from torchrl_etdmpc.training.builders import (
     resolve_device,
 )
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.distributed import WEIGHT_AGE, DistributedConfig
 from torchrl_etdmpc.training.memory import require_memory
 
 
@@ -57,8 +58,8 @@ class Learner:
         return self.collector.frames * self.config.task_spec.action_repeat
 
     def passed(self, interval: int) -> bool:
-        """Whether the last step of all environments passed a multiple of ``interval`` environment steps."""
-        before = self.env_steps - self.config.num_envs * self.config.task_spec.action_repeat
+        """Whether the last step passed a multiple of ``interval`` environment steps."""
+        before = self.env_steps - self.config.decisions_per_step * self.config.task_spec.action_repeat
         return self.env_steps // interval > before // interval
 
     def step(self, *, updates: bool = False) -> bool:
@@ -69,9 +70,9 @@ class Learner:
         """
         overlap = updates and self.config.overlap
         try:
-            acted = self.collector.act()
+            acted: Any = self.collector.act()
             if overlap:
-                self.updates()  # queued on a device, they run while the simulator steps
+                self.updates(self.config.num_envs)  # queued on a device, they run while the simulator steps
             stepped = self.collector.finish_step(acted)
         except (NonFiniteError, SimulatorError) as error:
             self._count_fault(error)
@@ -79,9 +80,16 @@ class Learner:
         self._note_episodes(stepped)
         if updates:
             self._decisions.add({"plan_fallbacks": stepped["plan", "fallback"].float().mean()})
+            self._note_weight_age(stepped)
         if updates and not overlap:
-            self.updates()
+            self.updates(stepped.numel())
         return True
+
+    def _note_weight_age(self, stepped: TensorDictBase) -> None:
+        """Where workers plan; -1 is the age of a random action."""
+        age = stepped.get(WEIGHT_AGE, None)
+        if age is not None and (age >= 0).any():
+            self._decisions.add({"weight_age": age[age >= 0].float().mean()})
 
     def _note_episodes(self, stepped: TensorDictBase) -> None:
         done = stepped["next", "done"]
@@ -112,9 +120,9 @@ class Learner:
             if self.reanalyze is not None and self.reanalyze.target_age is not None:
                 self._updates.add({"target_age": self.reanalyze.target_age})
 
-    def updates(self) -> None:
-        """The updates that one decision of every environment calls for."""
-        for _ in range(self.config.optim.updates_per_decision * self.config.num_envs):
+    def updates(self, decisions: int) -> None:
+        """The updates that so many decisions call for."""
+        for _ in range(self.config.optim.updates_per_decision * decisions):
             self.update()
 
     def pretrain(self) -> Iterator[None]:
@@ -136,7 +144,10 @@ class Learner:
         """
         row: dict[str, Any] = self._updates.means()
         self._check_updates(row)
-        row |= {"episode_return": math.nan} | self._decisions.means()
+        nothing = {"episode_return": math.nan}
+        if isinstance(self.config, DistributedConfig):
+            nothing["weight_age"] = math.nan
+        row |= nothing | self._decisions.means()
         if row.get("plan_fallbacks") == 1:
             warnings.warn(
                 "no plan since the last row had finite scores, so the policy acted instead; a lower "

@@ -1,0 +1,243 @@
+"""A run whose decisions are made by workers: its settings, and the collector that stands where the steps were."""
+
+from __future__ import annotations
+
+import warnings
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl import torchrl_logger
+from torchrl.collectors import BaseCollector
+from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
+
+from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.keys import NEXT, PLAN, VERSION, WORKER
+from torchrl_etdmpc.runs import first_line
+from torchrl_etdmpc.training.agent import Agent
+from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.ray_cluster import RayCluster
+from torchrl_etdmpc.training.workers import Actor, Engine, WorkerParts, send_weights, start_workers, why_it_failed
+
+WEIGHT_AGE = "weight_age"
+"""Key of a batch of rows: updates that the learner has made since the weights that each row was planned with."""
+
+
+@dataclass(frozen=True)
+class DistributedConfig(TrainConfig):
+    """A run whose decisions are made by workers; see :class:`WorkerCollector`."""
+
+    workers: int = 2
+    """Processes that plan and step, one environment each."""
+    engine: Engine = "multi"
+    """``multi``, processes of this machine; ``ray``, of a Ray cluster."""
+    address: str | None = None
+    """Of the Ray cluster: host:port, ray://host:port or auto. Default: one on this machine, for this run."""
+    rows_per_batch: int = 10
+    """Decisions that a worker makes before it sends them; fewer are fresher."""
+    send_every: int = 10
+    """Updates after which a worker that has sent its rows gets the weights anew."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, most in {"workers": 4096, "rows_per_batch": 100_000, "send_every": None}.items():
+            value = getattr(self, name)
+            if value < 1 or (most is not None and value > most):
+                bound = "at least 1" if value < 1 else f"at most {most}"
+                raise ValueError(f"{name} must be {bound}, got {value}.")
+        if self.address is not None and self.engine != "ray":
+            raise ValueError(f"address must be left out with engine={self.engine}, got {self.address!r}; say engine=ray.")
+        refused = {
+            "num_envs": (self.num_envs, 1, "each worker has one environment; raise workers"),
+            "overlap": (self.overlap, False, "workers step while the learner updates anyway"),
+            "replay.insertion": (self.replay.insertion, "step", "rows are stored when they arrive"),
+        }
+        for name, (value, needed, why) in refused.items():
+            if value != needed:
+                must, got = (str(word).lower() for word in (needed, value))
+                raise ValueError(f"{name} must be {must} with workers, got {got}: {why}.")
+
+    @property
+    def decisions_per_step(self) -> int:
+        """Decisions that come together."""
+        return self.rows_per_batch
+
+
+def is_distributed(settings: Mapping[str, Any]) -> bool:
+    """Whether stored settings are those of a run of workers."""
+    return "workers" in settings
+
+
+class WorkerCollector:
+    """Stands where :class:`~torchrl_etdmpc.collectors.StepCollector` does in a run; a step is a batch of one worker.
+
+    The workers plan and step in processes of their own (:func:`start_workers`) and go on while the learner updates, at
+    most two batches ahead of it. What is lost against one process:
+
+    - freshness of each step: a decision is made with weights that are some updates old (``weight_age`` in
+      ``train.csv``), and a row is stored when its batch arrives. Weights that arrive while a plan is made may mix with
+      those before them.
+    - exactness: which rows arrive when differs from run to run, and a run that goes on begins fresh episodes.
+
+    Where a worker fails, all are started anew, with other numbers and fresh episodes, and the failure counts as one of
+    the simulator. A worker that fails before it has sent a batch is an error: it would do so again.
+
+    Args:
+        config (DistributedConfig): the run.
+        agent (Agent): whose planner's weights are sent.
+        env (EnvBase): one that nobody steps, for its specs.
+        replay_buffer (ReplayBuffer): where rows go.
+        exclude_keys (sequence of NestedKey): what is not stored.
+
+    Raises:
+        ImportError, OSError, ValueError: if there is no Ray, or not the cluster that is asked for.
+    """
+
+    def __init__(
+        self, config: DistributedConfig, agent: Agent, env: EnvBase, replay_buffer: ReplayBuffer, *, exclude_keys: tuple
+    ) -> None:
+        self.config, self.agent, self.env, self.replay_buffer = config, agent, env, replay_buffer
+        self.exclude_keys = (*exclude_keys, (NEXT, WORKER))
+        agent.planner.make_tensordict_primer().check(env)
+        self._cluster = RayCluster(config.address, workers=config.workers) if config.engine == "ray" else None
+        self._frames = 0
+        self._next_number = 0  # of a worker: never twice in a run, so that no trajectory goes on in another one
+        self._workers: BaseCollector | None = None
+        self._batches: Iterator[TensorDictBase] = iter(())
+        self._numbers = range(0)
+        self._planning = False
+        self._arrived = False
+        self._sent: dict[int | None, int] = {}
+        self._last_worker: int | None = None
+
+    @property
+    def frames(self) -> int:
+        """Decisions so far that were stored."""
+        return self._frames
+
+    @property
+    def in_seed_phase(self) -> bool:
+        """Whether the workers act at random."""
+        return self._frames < self.config.seed_decisions
+
+    def act(self) -> None:
+        """Sees to it that the workers are there, and have weights that are fresh enough."""
+        try:
+            if self._workers is None:
+                self._start()
+            elif self._planning == self.in_seed_phase:
+                self._planning = not self.in_seed_phase
+                self._send(None)
+            elif self._planning:
+                self._send(self._last_worker)
+        except Exception as error:
+            raise self._failed(error) from error
+
+    def finish_step(self, acted: None = None) -> TensorDictBase:
+        """Waits for the next batch of a worker, checks and stores it.
+
+        Returns:
+            TensorDictBase: the rows, batch size [n]; what is not stored is in them too.
+
+        Raises:
+            SimulatorError: if a worker failed; the next call of :meth:`act` starts all of them anew.
+            NonFiniteError: if a row is not finite; likewise.
+        """
+        try:
+            rows = next(self._batches).reshape(-1)
+        except Exception as error:
+            raise self._failed(error) from error
+        rows = rows[: self.config.total_decisions - self._frames]  # the last batch may be more than the budget
+        self._check_finite(rows)
+        self._arrived = True
+        self._last_worker = int(rows[WORKER][0])
+        planned = rows[PLAN, VERSION]
+        rows[WEIGHT_AGE] = torch.where(planned > 0, self.agent.updater.updates - planned, -1)
+        self.replay_buffer.extend(rows.exclude(WEIGHT_AGE, *self.exclude_keys))
+        self._frames += len(rows)
+        return rows
+
+    def _start(self) -> None:
+        config, agent = self.config, self.agent
+        sizes = agent.world_model.observation_dim, agent.world_model.action_dim
+        compiled = agent.compile_mode if agent.planner.compiled_plan is not None else None
+        parts = WorkerParts(config, sizes, agent.planner.discount, compiled)
+        self._numbers = range(self._next_number, self._next_number + config.workers)
+        self._next_number += config.workers
+        self._arrived, self._last_worker = False, None
+        torchrl_logger.info(f"starting {config.workers} workers")
+        self._workers = start_workers(
+            parts, engine=config.engine, numbers=self._numbers, rows=config.rows_per_batch
+        )
+        self._planning = not self.in_seed_phase
+        self._send(None)
+        self._batches = iter(self._workers)
+
+    def _send(self, number: int | None) -> None:
+        """Sends the weights to one worker that has old ones, or to all of them."""
+        assert self._workers is not None
+        updates = self.agent.updater.updates
+        if number is not None and updates - self._sent[number] < self.config.send_every:
+            return
+        actor = Actor(self.agent.planner, planning=self._planning)
+        weights = TensorDict.from_module(actor).data.cpu().clone()  # in memory that may be shared
+        send_weights(self._workers, weights, None if number is None else number - self._numbers.start)
+        # Workers of one machine read the same memory.
+        some = number is not None and self.config.engine == "ray"
+        self._sent |= {worker: updates for worker in ([number] if some else self._numbers)}
+
+    def _failed(self, error: BaseException) -> Exception:
+        """The error to raise: of the simulator if new workers may do better."""
+        if self._workers is None:  # they did not start
+            return RuntimeError(f"the workers cannot be started: {first_line(error)}")
+        text = why_it_failed(self._workers, error)
+        self._stop()
+        if not self._arrived:
+            return RuntimeError(f"{text}, before it sent a row")
+        return SimulatorError(f"{text}; all workers are started anew")
+
+    def _check_finite(self, rows: TensorDictBase) -> None:
+        for key, value in rows.exclude(*self.exclude_keys).items(True, True):
+            if value.is_floating_point() and not value.isfinite().all():
+                number = int(rows[WORKER][0]) - self._numbers.start
+                self._stop()
+                raise NonFiniteError(
+                    f"worker {number} sent a non-finite {key!r} after {self._frames} decisions; its rows were not "
+                    "stored, and all workers are started anew"
+                )
+
+    def _stop(self) -> None:
+        workers, self._workers, self._batches = self._workers, None, iter(())
+        if workers is None:
+            return
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                workers.shutdown()
+        except Exception as error:  # whatever is broken is given up
+            torchrl_logger.warning(f"workers did not end in order: {first_line(error)}")
+
+    def shutdown(self, raise_on_error: bool = True) -> None:
+        """Ends the workers, and the cluster if it is the run's own."""
+        self._stop()
+        if self._cluster is not None:
+            self._cluster.close()
+            self._cluster = None
+        if not self.env.is_closed:
+            self.env.close(raise_if_closed=raise_on_error)
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Nothing to do: new workers have seeds of their own."""
+        return seed
+
+    def state_dict(self) -> OrderedDict:
+        """Counters; the episodes that are running are given up."""
+        return OrderedDict(frames=self._frames, next_number=self._next_number)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores :meth:`state_dict`; fresh episodes begin."""
+        self._frames, self._next_number = state_dict["frames"], state_dict["next_number"]

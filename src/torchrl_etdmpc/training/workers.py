@@ -1,0 +1,210 @@
+"""Workers that plan and step in processes of their own, on TorchRL's collectors: what runs in them, how they start."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+import warnings
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl import torchrl_logger
+from torchrl.collectors import BaseCollector, MultiAsyncCollector
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase, TensorDictPrimer
+from torchrl.weight_update import SharedMemWeightSyncScheme
+
+from torchrl_etdmpc.collectors import SeedPolicy
+from torchrl_etdmpc.envs import import_task, make_env
+from torchrl_etdmpc.keys import WORKER
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner
+from torchrl_etdmpc.runs import first_line
+from torchrl_etdmpc.training.agent import build_planner, build_world_model
+from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
+from torchrl_etdmpc.training.own_code import follow_own_code
+
+Engine = Literal["multi", "ray"]
+
+_LOOK_EVERY_S = 0.5
+
+
+class Actor(TensorDictModuleBase):
+    """Acts as the seed policy does until it is told to plan: by ``planning``, a buffer that is sent with the weights.
+
+    Args:
+        planner (EnsembleMPPIPlanner): acts when ``planning`` is true.
+        planning (bool): Default: ``False``.
+    """
+
+    planning: torch.Tensor
+
+    def __init__(self, planner: EnsembleMPPIPlanner, *, planning: bool = False) -> None:
+        super().__init__()
+        self.planner = planner
+        self.seed_policy = SeedPolicy(planner.action_spec)
+        self.in_keys, self.out_keys = planner.in_keys, planner.out_keys
+        self.register_buffer("planning", torch.tensor(planning))
+
+    @property
+    def spec(self) -> Composite:
+        """That of the planner: a collector which asks need not try a plan."""
+        return self.planner.spec
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """That of the planner."""
+        return self.planner.make_tensordict_primer()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes an action and its plan."""
+        return self.planner(tensordict) if self.planning else self.seed_policy(tensordict)
+
+
+@dataclass(frozen=True)
+class WorkerParts:
+    """What a worker makes in its own process, by the settings of the run.
+
+    Args:
+        config (TrainConfig): the run.
+        sizes (tuple of int): O and A.
+        discount (float): of the planner.
+        compile_mode (str, optional): of the planner. Default: ``None``, eager.
+    """
+
+    config: TrainConfig
+    sizes: tuple[int, int]
+    discount: float
+    compile_mode: str | None = None
+
+    def make_env(self, number: int) -> EnvBase:
+        """The environment of one worker, whose rows carry its number.
+
+        Args:
+            number (int): of the worker, among all that the run has started.
+        """
+        self._prepare()
+        seed = (self.config.seed * 1_000_003 + number) % 2**32
+        torch.manual_seed(seed)
+        env = make_env(self.config.task_spec, seed=seed)
+        primer = TensorDictPrimer({WORKER: Unbounded((1,), dtype=torch.int64)}, default_value=number)
+        return env.append_transform(primer)
+
+    def make_actor(self) -> Actor:
+        """The planner on networks of the run's sizes; their weights arrive later."""
+        self._prepare()
+        config = self.config
+        world_model = build_world_model(config.model, *self.sizes, terminates=config.task_spec.terminates)
+        options: dict[str, Any] = {"discount": self.discount, "compile_mode": self.compile_mode}
+        return Actor(build_planner(world_model, config.planner, warm_start=True, **options))
+
+    def _prepare(self) -> None:
+        """Imports what the command line has made the owner import."""
+        config = self.config
+        if ":" in config.task:
+            import_task(config.task, **{name: getattr(config, name) for name in TASK_SETTINGS})
+        follow_own_code("planner.score", config.planner.score)
+
+
+def leave_signals_to_the_owner() -> None:
+    """In a worker: Ctrl-C and job schedulers signal all processes of a job; it ends when its owner says so or is gone."""
+    torchrl_logger.setLevel("WARNING")
+    for name in ("SIGINT", "SIGTERM", "SIGUSR1"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+
+def start_workers(parts: WorkerParts, *, engine: Engine, numbers: range, rows: int) -> BaseCollector:
+    """Starts workers; they act as the seed policy until weights come.
+
+    Args:
+        parts (WorkerParts): what each of them makes.
+
+    Keyword Args:
+        engine (str): ``"multi"``, processes of this machine; ``"ray"``, actors of the cluster that is connected.
+        numbers (range): of the workers.
+        rows (int): decisions in a batch, which comes from one worker.
+
+    Returns:
+        BaseCollector: yields the batches as they come in.
+    """
+    makers: Any = [partial(parts.make_env, number) for number in numbers]
+    options: dict[str, Any] = {"policy_factory": parts.make_actor, "frames_per_batch": rows}
+    if engine == "multi":
+        return MultiAsyncCollector(
+            makers,
+            **options,
+            total_frames=-1,
+            use_buffers=False,
+            weight_sync_schemes={"policy": SharedMemWeightSyncScheme()},
+            auto_register_policy_transforms=True,
+            num_threads=torch.get_num_threads(),
+            init_fn=leave_signals_to_the_owner,
+        )
+    from torchrl.collectors.distributed import RayCollector
+
+    in_worker = {"auto_register_policy_transforms": True, "use_buffers": False}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The policy is not an nn.Module")  # its factory makes one
+        return RayCollector(
+            makers,
+            **options,
+            total_frames=sys.maxsize,
+            collector_kwargs=[dict(in_worker) for _ in numbers],
+            remote_configs={"num_cpus": 1},
+        )
+
+
+def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int | None = None) -> None:
+    """Sends weights to a worker, and waits until it has them.
+
+    Args:
+        collector (BaseCollector): that :func:`start_workers` returned.
+        weights (TensorDictBase): of an :class:`Actor`; nobody else may hold their memory.
+        worker (int, optional): its place. Default: all of them.
+
+    Raises:
+        RuntimeError: if a worker has ended.
+    """
+    raised: list[BaseException] = []
+
+    def send() -> None:
+        try:
+            collector.update_policy_weights_(weights, worker_ids=None if worker is None else [worker])
+        except BaseException as error:
+            raised.append(error)
+
+    # TorchRL waits for the answer of a worker that has died for ever.
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    while sender.is_alive():
+        sender.join(_LOOK_EVERY_S)
+        ended = ended_worker(collector)
+        if ended is not None:
+            raise RuntimeError(ended)
+    if raised:
+        raise raised[0]
+
+
+def ended_worker(collector: BaseCollector) -> str | None:
+    """A sentence on a worker process of this machine that has ended, if there is one."""
+    for number, process in enumerate(getattr(collector, "procs", ())):
+        with contextlib.suppress(ValueError):  # TorchRL has closed it
+            if process.exitcode is not None:
+                return f"worker {number} ended (exit code {process.exitcode})"
+    return None
+
+
+def why_it_failed(collector: BaseCollector, error: BaseException) -> str:
+    """What became of the workers, in one line.
+
+    Args:
+        collector (BaseCollector): that :func:`start_workers` returned.
+        error (BaseException): what it raised.
+    """
+    cause = getattr(error, "cause", None) or error  # of Ray, whose own text is a traceback
+    return ended_worker(collector) or f"a worker failed: {first_line(cause).rstrip('.')}"
