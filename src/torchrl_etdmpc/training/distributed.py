@@ -111,7 +111,7 @@ class WorkerCollector:
         self._numbers = range(0)
         self._planning = False
         self._arrived = False
-        self._sent: dict[int | None, int] = {}
+        self._sent: dict[int, int] = {}  # by worker, the updates that its weights had
         self._last_worker: int | None = None
 
     @property
@@ -185,10 +185,10 @@ class WorkerCollector:
             return
         actor = Actor(self.agent.planner, planning=self._planning)
         weights = TensorDict.from_module(actor).data.cpu().clone()  # in memory that may be shared
+        if number is not None and self.config.engine == "multi":
+            number = None  # they read the same memory
         send_weights(self._workers, weights, None if number is None else number - self._numbers.start)
-        # Workers of one machine read the same memory.
-        some = number is not None and self.config.engine == "ray"
-        self._sent |= {worker: updates for worker in ([number] if some else self._numbers)}
+        self._sent |= dict.fromkeys(self._numbers if number is None else [number], updates)
 
     def _failed(self, error: BaseException) -> Exception:
         """The error to raise: of the simulator if new workers may do better."""

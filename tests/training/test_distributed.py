@@ -1,0 +1,368 @@
+"""Workers in the place of steps: quick ones in this process, real ones of both engines."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+
+pytest.importorskip("gymnasium")
+
+import torchrl_etdmpc.training.distributed as distributed  # noqa: E402
+from torchrl_etdmpc.checkpoints import CheckpointStore  # noqa: E402
+from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError  # noqa: E402
+from torchrl_etdmpc.envs import make_env  # noqa: E402
+from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
+from torchrl_etdmpc.training import (  # noqa: E402
+    DistributedConfig,
+    Learner,
+    TrainConfig,
+    launch,
+    read_agent_file,
+    read_run_config,
+)
+from torchrl_etdmpc.training.ray_cluster import RayCluster  # noqa: E402
+
+TINY: dict[str, Any] = {
+    "task": "gym/Pendulum-v1",
+    "preset": "cpu",
+    "total_env_steps": 200,
+    "episode_length": 20,
+    "compile": "off",
+    "threads": 1,
+    "eval_every": 100_000,
+    "eval_episodes": 1,
+    "log_every": 50,
+    "rows_per_batch": 8,
+    "send_every": 4,
+    "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 1},
+    "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+    "reanalyze": {
+        **{"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 1},
+        **{"every": 3, "num_slices": 2},
+    },
+    "optim": {"batch_size": 4},
+    "replay": {"seed_decisions": 40, "pretrain_updates": 5},
+}
+
+
+def config_of(**changes: Any) -> DistributedConfig:
+    return DistributedConfig.from_dict(TINY | changes)
+
+
+class Workers:
+    """Workers in this process, in turn, as the multi-process collectors drive them; batch ``fails_at`` fails."""
+
+    def __init__(self, parts, numbers: range, rows: int, error: BaseException | None, fails_at: int) -> None:
+        self.actors = [parts.make_actor() for _ in numbers]
+        options: dict[str, Any] = {"frames_per_batch": rows, "total_frames": -1, "auto_register_policy_transforms": True}
+        makers = zip(numbers, self.actors, strict=True)
+        self.workers = [Collector(parts.make_env(number), actor, **options) for number, actor in makers]
+        self.error, self.fails_at, self.closed = error, fails_at, False
+        self.sent: list[tuple[list[int] | None, bool, int]] = []
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        iterators = [iter(worker) for worker in self.workers]
+        batches = 0
+        while True:
+            for iterator in iterators:
+                if batches == self.fails_at and self.error is not None:
+                    raise self.error
+                batches += 1
+                yield next(iterator)
+
+    def update_policy_weights_(self, weights: TensorDictBase, worker_ids: list[int] | None = None) -> None:
+        places = range(len(self.actors)) if worker_ids is None else worker_ids
+        for place in places:
+            TensorDict.from_module(self.actors[place]).data.update_(weights)
+        version = weights["planner", "module", "world_model", "version"]
+        self.sent.append((worker_ids, bool(weights["planning"]), int(version)))
+
+    def shutdown(self) -> None:
+        self.closed = True
+        for worker in self.workers:
+            worker.shutdown()
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Workers]]:
+    """Replaces processes by workers in this one; returns those that were started, as they are."""
+
+    def replace(*, error: BaseException | None = None, fails_at: int = 0) -> list[Workers]:
+        every: list[Workers] = []
+
+        def start(parts, *, engine: str, numbers: range, rows: int) -> Any:
+            every.append(Workers(parts, numbers, rows, None if every else error, fails_at))
+            return every[-1]
+
+        monkeypatch.setattr(distributed, "start_workers", start)
+        return every
+
+    return replace
+
+
+def learner_of(config: DistributedConfig) -> Learner:
+    torch.manual_seed(0)
+    return Learner(config, make_env(config.task_spec, seed=0))
+
+
+def explore_and_pretrain(learner: Learner) -> None:
+    while learner.collector.in_seed_phase:
+        learner.step()
+    for _ in learner.pretrain():
+        pass
+
+
+def test_workers_act_at_random_until_they_get_weights_to_plan_with(started):
+    workers, learner = started(), learner_of(config_of(reanalyze=TINY["reanalyze"] | {"every": 0}))
+    explore_and_pretrain(learner)
+    assert workers[0].sent == [(None, False, 0)]
+    learner.step(updates=True)
+    assert workers[0].sent[1:] == [(None, True, 5)]
+    rows = learner.replay[:]
+    assert rows["plan", "scale"][:40].eq(1).all() and rows["plan", "version"][:40].eq(0).all()
+    assert rows["plan", "version"][40:].eq(5).all() and rows["plan", "scale"][40:].ne(1).any()
+    learner.collector.shutdown()
+    assert workers[0].closed
+
+
+def test_a_row_says_how_many_updates_older_its_weights_were_than_the_learner_s(started):
+    started()
+    learner = learner_of(config_of(send_every=20))
+    explore_and_pretrain(learner)
+    ages = []
+    for _ in range(6):
+        learner.collector.act()
+        rows = learner.collector.finish_step()
+        ages.append(rows["weight_age"].unique().tolist())
+        learner.updates(rows.numel())
+    # They read the same memory, which is written anew 24 updates later.
+    assert ages == [[0], [8], [16], [0], [8], [16]]
+    learner.collector.shutdown()
+
+
+def test_only_the_worker_that_sent_rows_gets_weights_where_each_has_its_own(started, monkeypatch):
+    monkeypatch.setattr(distributed, "RayCluster", lambda address, *, workers: RayConnection())
+    workers, learner = started(), learner_of(config_of(engine="ray"))
+    explore_and_pretrain(learner)
+    for _ in range(4):
+        learner.step(updates=True)
+    first = 40 // 8 % 2  # whose turn it is after the random phase
+    assert [place for place, planning, _ in workers[0].sent if planning] == [None, *([[first], [1 - first]] * 2)[:3]]
+    learner.collector.shutdown()
+
+
+class RayConnection:
+    def close(self) -> None:
+        pass
+
+
+def test_slices_never_join_the_rows_of_two_workers(started):
+    started()
+    learner = learner_of(config_of(workers=3, rows_per_batch=7))
+    explore_and_pretrain(learner)
+    numbers = learner.replay[:]["worker"].flatten()
+    assert numbers.unique().tolist() == [0, 1, 2]
+    assert learner.replay[:]["collector", "traj_ids"].unique().tolist() == [0]  # of each worker
+    for _ in range(20):
+        slices = learner.replay.sample().reshape(-1, 3)
+        assert (slices["worker"] == slices["worker"][:, :1]).all()
+        assert torch.equal(slices["next", "observation"][:, :-1], slices["observation"][:, 1:])
+    learner.collector.shutdown()
+
+
+def test_the_budget_is_kept_to_the_step(started):
+    started()
+    learner = learner_of(config_of(total_env_steps=53, replay=TINY["replay"] | {"seed_decisions": 30}))
+    explore_and_pretrain(learner)
+    while learner.env_steps < 53:
+        learner.step(updates=True)
+    assert learner.env_steps == len(learner.replay) == 53
+    assert learner.agent.updater.updates == 5 + 53 - 32
+    learner.collector.shutdown()
+
+
+def test_after_a_failure_other_workers_go_on_in_fresh_episodes(started):
+    workers, learner = started(error=RuntimeError("the physics is invalid"), fails_at=8), learner_of(config_of())
+    explore_and_pretrain(learner)
+    with pytest.warns(UserWarning, match="a worker failed: the physics is invalid; all workers are started anew; training"):
+        while learner.step(updates=True):
+            pass
+    assert learner.faults == 1 and workers[0].closed
+    for _ in range(2):
+        learner.step(updates=True)
+    assert workers[1].sent[0] == (None, True, learner.agent.updater.updates - 16)
+    assert learner.replay[:]["worker"].unique().tolist() == [0, 1, 2, 3]
+    learner.collector.shutdown()
+
+
+def test_a_worker_that_fails_before_its_first_rows_ends_the_run(started):
+    started(error=ValueError("no such simulator\nmore"))
+    learner = learner_of(config_of())
+    with pytest.raises(RuntimeError, match="^a worker failed: no such simulator, before it sent a row$") as caught:
+        learner.step()
+    assert not isinstance(caught.value, SimulatorError)
+    learner.collector.shutdown()
+
+
+def test_rows_that_are_not_finite_are_not_stored(started):
+    workers, learner = started(), learner_of(config_of(workers=1))
+    learner.step()
+    next_rows = iter(workers[0])
+
+    def broken() -> Iterator[TensorDictBase]:
+        rows = next(next_rows)
+        rows["next", "reward"][3] = math.nan
+        yield rows
+
+    learner.collector._batches = broken()
+    learner.collector.act()
+    with pytest.raises(NonFiniteError, match=r"worker 0 sent a non-finite \('next', 'reward'\) after 8 decisions"):
+        learner.collector.finish_step()
+    assert len(learner.replay) == 8 and workers[0].closed
+    learner.collector.shutdown()
+
+
+def test_what_goes_on_from_a_checkpoint_numbers_its_workers_on(started):
+    started()
+    first = learner_of(config_of())
+    first.step()
+    second = learner_of(config_of())
+    second.collector.load_state_dict(first.collector.state_dict())
+    second.step()
+    assert second.collector.frames == 16
+    assert set(second.replay[:]["worker"].flatten().tolist()) <= {2, 3}
+    for learner in (first, second):
+        learner.collector.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"workers": 0}, "workers must be at least 1, got 0."),
+        ({"workers": 5000}, "workers must be at most 4096, got 5000."),
+        ({"rows_per_batch": 0}, "rows_per_batch must be at least 1, got 0."),
+        ({"send_every": 0}, "send_every must be at least 1, got 0."),
+        ({"engine": "slurm"}, "engine must be one of multi, ray, got 'slurm'."),
+        ({"address": "auto"}, "address must be left out with engine=multi, got 'auto'; say engine=ray."),
+        ({"num_envs": 2}, "num_envs must be 1 with workers, got 2: each worker has one environment; raise workers."),
+        ({"overlap": True}, "overlap must be false with workers, got true: workers step while the learner updates"),
+        (
+            {"replay": {"insertion": "episode", "seed_decisions": 40}, "total_env_steps": 300},
+            "replay.insertion must be step with workers, got episode: rows are stored when they arrive.",
+        ),
+    ],
+)
+def test_settings_that_workers_cannot_follow_are_refused(changes, message):
+    with pytest.raises(ValueError) as caught:
+        config_of(**changes)
+    assert str(caught.value).startswith(message)
+
+
+def test_agent_files_know_nothing_of_workers(started, tmp_path):
+    started()
+    line = launch(config_of(run_dir=str(tmp_path / "run"), total_env_steps=60, log_every=10))
+    directory = RunDirectory(tmp_path / "run")
+    assert line.startswith("gym/Pendulum-v1: return ") and directory.finished
+    stored = read_agent_file(directory.last_agent)["config"]
+    assert TrainConfig.from_dict(stored).task == "gym/Pendulum-v1"
+    assert read_run_config(directory, DistributedConfig).workers == 2
+    assert CheckpointStore(directory.checkpoints).exists()
+    with directory.train.open() as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[-1]["weight_age"]) >= 0
+    # It may go on, with other workers, and a run of one process may not go on with it.
+    longer = config_of(run_dir=str(tmp_path / "run"), total_env_steps=80, workers=1, resume="on")
+    assert "80 env steps" in launch(longer, ["total_env_steps", "workers", "resume"])
+    with pytest.raises(ValueError, match="is a run of workers; go on with the command distributed, or start a new"):
+        read_run_config(directory)
+
+
+def test_a_run_of_one_process_is_not_gone_on_with_by_workers(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    directory.begin(TrainConfig.from_dict({key: TINY[key] for key in ("task", "total_env_steps", "replay")}).to_dict())
+    with pytest.raises(ValueError, match="is a run of one process; go on with the command train, or start a new run_dir"):
+        read_run_config(directory, DistributedConfig)
+    directory.close()
+
+
+@pytest.mark.parametrize(
+    ("address", "error", "message"),
+    [
+        ("127.0.0.1:1", OSError, r"address=127.0.0.1:1 cannot be reached \(Connection refused\); start Ray there"),
+        ("ray://127.0.0.1:1", OSError, r"address=ray://127.0.0.1:1 cannot be reached \(Connection refused\)"),
+        ("localhost", ValueError, "address must be host:port, ray://host:port or auto, got 'localhost'."),
+    ],
+)
+def test_an_address_where_no_cluster_is_costs_one_line_and_nothing_else(address, error, message, tmp_path):
+    pytest.importorskip("ray")
+    with pytest.raises(error, match=message):
+        launch(config_of(engine="ray", address=address, run_dir=str(tmp_path / "run")))
+    assert not (tmp_path / "run").exists()
+
+
+def processes_of(owner: int) -> set[int]:
+    """The children of a process, without what Python itself keeps for semaphores and forks."""
+    found = set()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            stat = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(stat[1]) == owner and stat[0] != "Z" and b"spawn_main" in (folder / "cmdline").read_bytes():
+                found.add(int(folder.name))
+        except (OSError, IndexError):
+            continue
+    return found
+
+
+def test_two_processes_collect_and_none_is_left(tmp_path, monkeypatch):
+    before = processes_of(os.getpid())
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    line = launch(config_of(run_dir=str(tmp_path / "run")))
+    assert "after 200 env steps" in line
+    directory = RunDirectory(tmp_path / "run")
+    with directory.train.open() as file:
+        rows = list(csv.DictReader(file))
+    assert int(rows[-1]["env_steps"]) == 200 and int(rows[-1]["updates"]) == 5 + 160
+    assert 0 <= float(rows[-1]["weight_age"]) < 60 and float(rows[-1]["target_age"]) >= 0
+    assert processes_of(os.getpid()) <= before
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_worker_process_that_is_killed_is_replaced(tmp_path):
+    learner = learner_of(config_of(total_env_steps=2000))
+    before = processes_of(os.getpid())
+    explore_and_pretrain(learner)
+    os.kill(min(processes_of(os.getpid()) - before), signal.SIGKILL)
+    with pytest.warns(UserWarning, match=r"worker \d ended \(exit code -9\); all workers are started anew"):
+        while learner.step(updates=True):
+            pass
+    assert all(learner.step(updates=True) for _ in range(4))
+    learner.collector.shutdown()
+    assert processes_of(os.getpid()) <= before
+
+
+@pytest.mark.slow
+def test_actors_of_a_ray_cluster_collect_and_the_cluster_ends(tmp_path, monkeypatch, capfd):
+    ray = pytest.importorskip("ray")
+    line = launch(config_of(run_dir=str(tmp_path / "run"), engine="ray"))
+    assert "after 200 env steps" in line and not ray.is_initialized()
+    with RunDirectory(tmp_path / "run").train.open() as file:
+        rows = list(csv.DictReader(file))
+    assert int(rows[-1]["updates"]) == 5 + 160
+    assert 0 <= float(rows[-1]["weight_age"]) < 60
+    assert "ray" not in capfd.readouterr().err.lower(), "Ray is not silent"
+    with pytest.raises(ValueError, match="workers must be at most the 1 CPUs of the Ray cluster, got 3"):
+        monkeypatch.setattr(ray, "cluster_resources", lambda: {"CPU": 1.0})
+        RayCluster(None, workers=3)
+    assert not ray.is_initialized()
