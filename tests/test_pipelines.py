@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from torchrl.data import (
     TensorDictReplayBuffer,
     Unbounded,
 )
-from torchrl.envs import EnvBase, InitTracker, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, InitTracker, ParallelEnv, SerialEnv, TensorDictPrimer, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc import (
@@ -37,6 +38,7 @@ from torchrl_etdmpc import (
     StepSliceSampler,
     WorldModel,
 )
+from torchrl_etdmpc.training.ray_cluster import RayCluster
 
 SLICE_LEN, NUM_SLICES, FRAMES, BATCHES = 3, 16, 24, 4
 TRAJECTORY, WORKER = ("collector", "traj_ids"), "worker"
@@ -123,6 +125,32 @@ def with_one_collector_per_worker(_) -> Iterator[TensorDictBase]:
             yield batch.set(WORKER, torch.full(batch.batch_size, number))
 
 
+def with_ray(planner) -> Iterator[TensorDictBase]:
+    """Two workers of a cluster of this machine; each counts its episodes from 0, and its environment says its number."""
+    ray = pytest.importorskip("ray")
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers cannot import this file
+    from torchrl.collectors.distributed import RayCollector
+
+    cluster = RayCluster(None, workers=2)
+    try:
+        numbers = [TensorDictPrimer({WORKER: Unbounded(1, dtype=torch.int64)}, default_value=k) for k in range(2)]
+        makers = [functools.partial(make_numbered_env, k, number) for k, number in enumerate(numbers)]
+        options: dict = {"frames_per_batch": FRAMES, "total_frames": FRAMES * BATCHES, "remote_configs": {"num_cpus": 1}}
+        options["sync"] = True  # else batches come in any order, and episodes are joined or not
+        options["collector_kwargs"] = [{"auto_register_policy_transforms": True} for _ in makers]
+        collector = RayCollector(makers, planner, **options)
+        collector.update_policy_weights_(planner)
+        for batch in collector:  # which shuts itself down
+            yield batch.exclude("plan_mean", ("next", "plan_mean"), ("next", WORKER)).clone()
+    finally:
+        cluster.close()
+        ray.cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
+
+
+def make_numbered_env(number: int, primer: TensorDictPrimer) -> TransformedEnv:
+    return make_env(number).append_transform(primer)
+
+
 SOURCES: dict[tuple[str, str], Callable[[EnsembleMPPIPlanner], Iterator[TensorDictBase]]] = {
     ("StepCollector", "single"): lambda planner: with_step_collector(make_env(), planner),
     ("StepCollector", "SerialEnv"): lambda planner: with_step_collector(SerialEnv(2, MAKERS), planner),
@@ -138,6 +166,7 @@ SOURCES: dict[tuple[str, str], Callable[[EnsembleMPPIPlanner], Iterator[TensorDi
     ("MultiSyncCollector", "single"): lambda planner: with_collector(MultiSyncCollector, MAKERS, planner),
     ("MultiAsyncCollector", "single"): lambda planner: with_collector(MultiAsyncCollector, MAKERS, planner),
     ("AsyncBatchedCollector", "single"): with_async_batched,
+    ("RayCollector", "single"): with_ray,
     ("one Collector per worker", "single"): with_one_collector_per_worker,
 }
 
@@ -222,9 +251,10 @@ TABLE = {
     ("MultiSyncCollector", "single", TWO): ("flat", "yes", "yes", "yes"),
     ("MultiAsyncCollector", "single", FLAT): ALL,
     ("AsyncBatchedCollector", "single", FLAT): JOINED,
+    ("RayCollector", "single", FLAT): JOINED,
     ("one Collector per worker", "single", FLAT): JOINED,
 }
-SLOW = {"MultiSyncCollector", "MultiAsyncCollector"}  # starting processes takes ten seconds
+SLOW = {"MultiSyncCollector", "MultiAsyncCollector", "RayCollector"}  # starting processes takes ten seconds
 
 
 def _cells():
