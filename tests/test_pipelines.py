@@ -126,7 +126,7 @@ def with_one_collector_per_worker(_) -> Iterator[TensorDictBase]:
 
 
 def with_ray(planner) -> Iterator[TensorDictBase]:
-    """Two workers of a cluster of this machine; each counts its episodes from 0, and its environment says its number."""
+    """Two workers of a cluster of this machine: each counts its episodes from 0; its environment knows its number."""
     ray = pytest.importorskip("ray")
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers cannot import this file
     from torchrl.collectors.distributed import RayCollector
@@ -135,7 +135,8 @@ def with_ray(planner) -> Iterator[TensorDictBase]:
     try:
         numbers = [TensorDictPrimer({WORKER: Unbounded(1, dtype=torch.int64)}, default_value=k) for k in range(2)]
         makers = [functools.partial(make_numbered_env, k, number) for k, number in enumerate(numbers)]
-        options: dict = {"frames_per_batch": FRAMES, "total_frames": FRAMES * BATCHES, "remote_configs": {"num_cpus": 1}}
+        options: dict = {"frames_per_batch": FRAMES, "total_frames": FRAMES * BATCHES}
+        options["remote_configs"] = {"num_cpus": 1}
         options["sync"] = True  # else batches come in any order, and episodes are joined or not
         options["collector_kwargs"] = [{"auto_register_policy_transforms": True} for _ in makers]
         collector = RayCollector(makers, planner, **options)

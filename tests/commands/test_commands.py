@@ -39,7 +39,7 @@ def run_command(monkeypatch, capsys):
 
 def test_the_wheel_s_command_is_the_examples_code():
     assert PROJECT["project"]["scripts"] == {"torchrl-etdmpc": "torchrl_etdmpc.commands:main"}
-    for name in ("train", "train_dmc", "evaluate", "export", "report"):
+    for name in ("train", "train_dmc", "distributed", "evaluate", "export", "report"):
         assert f'main("{name}")' in (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
 
 

@@ -65,7 +65,7 @@ class Workers:
 
     def __init__(self, parts, numbers: range, rows: int, error: BaseException | None, fails_at: int) -> None:
         self.actors = [parts.make_actor() for _ in numbers]
-        options: dict[str, Any] = {"frames_per_batch": rows, "total_frames": -1, "auto_register_policy_transforms": True}
+        options: dict[str, Any] = {"frames_per_batch": rows, "auto_register_policy_transforms": True}
         makers = zip(numbers, self.actors, strict=True)
         self.workers = [Collector(parts.make_env(number), actor, **options) for number, actor in makers]
         self.error, self.fails_at, self.closed = error, fails_at, False
@@ -195,7 +195,7 @@ def test_the_budget_is_kept_to_the_step(started):
 def test_after_a_failure_other_workers_go_on_in_fresh_episodes(started):
     workers, learner = started(error=RuntimeError("the physics is invalid"), fails_at=8), learner_of(config_of())
     explore_and_pretrain(learner)
-    with pytest.warns(UserWarning, match="a worker failed: the physics is invalid; all workers are started anew; training"):
+    with pytest.warns(UserWarning, match="a worker failed: the physics is invalid; all workers are started anew; "):
         while learner.step(updates=True):
             pass
     assert learner.faults == 1 and workers[0].closed
@@ -291,7 +291,7 @@ def test_agent_files_know_nothing_of_workers(started, tmp_path):
 def test_a_run_of_one_process_is_not_gone_on_with_by_workers(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     directory.begin(TrainConfig.from_dict({key: TINY[key] for key in ("task", "total_env_steps", "replay")}).to_dict())
-    with pytest.raises(ValueError, match="is a run of one process; go on with the command train, or start a new run_dir"):
+    with pytest.raises(ValueError, match="is a run of one process; go on with the command train, or start a new"):
         read_run_config(directory, DistributedConfig)
     directory.close()
 

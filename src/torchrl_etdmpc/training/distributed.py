@@ -50,7 +50,9 @@ class DistributedConfig(TrainConfig):
                 bound = "at least 1" if value < 1 else f"at most {most}"
                 raise ValueError(f"{name} must be {bound}, got {value}.")
         if self.address is not None and self.engine != "ray":
-            raise ValueError(f"address must be left out with engine={self.engine}, got {self.address!r}; say engine=ray.")
+            raise ValueError(
+                f"address must be left out with engine={self.engine}, got {self.address!r}; say engine=ray."
+            )
         refused = {
             "num_envs": (self.num_envs, 1, "each worker has one environment; raise workers"),
             "overlap": (self.overlap, False, "workers step while the learner updates anyway"),
@@ -170,9 +172,7 @@ class WorkerCollector:
         self._next_number += config.workers
         self._arrived, self._last_worker = False, None
         torchrl_logger.info(f"starting {config.workers} workers")
-        self._workers = start_workers(
-            parts, engine=config.engine, numbers=self._numbers, rows=config.rows_per_batch
-        )
+        self._workers = start_workers(parts, engine=config.engine, numbers=self._numbers, rows=config.rows_per_batch)
         self._planning = not self.in_seed_phase
         self._send(None)
         self._batches = iter(self._workers)
@@ -184,7 +184,8 @@ class WorkerCollector:
         if number is not None and updates - self._sent[number] < self.config.send_every:
             return
         actor = Actor(self.agent.planner, planning=self._planning)
-        weights = TensorDict.from_module(actor).data.cpu().clone()  # in memory that may be shared
+        live: Any = TensorDict.from_module(actor)
+        weights = live.data.cpu().clone()  # in memory that may be shared
         if number is not None and self.config.engine == "multi":
             number = None  # they read the same memory
         send_weights(self._workers, weights, None if number is None else number - self._numbers.start)

@@ -182,7 +182,9 @@ def read_run_config(directory: RunDirectory, kind: type[TrainConfig] = TrainConf
         by_workers = is_distributed(values)
         if by_workers != issubclass(kind, DistributedConfig):
             who, command = ("workers", "distributed") if by_workers else ("one process", "train")
-            raise ValueError(f"{directory} is a run of {who}; go on with the command {command}, or start a new run_dir.")
+            raise ValueError(
+                f"{directory} is a run of {who}; go on with the command {command}, or start a new run_dir."
+            )
     try:
         return kind.from_dict(values)
     except (ValueError, TypeError) as error:

@@ -48,7 +48,9 @@ class Actor(TensorDictModuleBase):
         super().__init__()
         self.planner = planner
         self.seed_policy = SeedPolicy(planner.action_spec)
-        self.in_keys, self.out_keys = planner.in_keys, planner.out_keys
+        # TorchRL's types know one key only.
+        self.in_keys = planner.in_keys  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = planner.out_keys  # pyright: ignore[reportAttributeAccessIssue]
         self.register_buffer("planning", torch.tensor(planning))
 
     @property
@@ -91,7 +93,7 @@ class WorkerParts:
         seed = (self.config.seed * 1_000_003 + number) % 2**32
         torch.manual_seed(seed)
         env = make_env(self.config.task_spec, seed=seed)
-        primer = TensorDictPrimer({WORKER: Unbounded((1,), dtype=torch.int64)}, default_value=number)
+        primer = TensorDictPrimer({WORKER: Unbounded(1, dtype=torch.int64)}, default_value=number)
         return env.append_transform(primer)
 
     def make_actor(self) -> Actor:
@@ -111,7 +113,7 @@ class WorkerParts:
 
 
 def leave_signals_to_the_owner() -> None:
-    """In a worker: Ctrl-C and job schedulers signal all processes of a job; it ends when its owner says so or is gone."""
+    """In a worker: Ctrl-C signals all processes of a job, but it ends when its owner says so or is gone."""
     torchrl_logger.setLevel("WARNING")
     for name in ("SIGINT", "SIGTERM", "SIGUSR1"):
         if hasattr(signal, name):
