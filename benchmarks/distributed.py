@@ -97,7 +97,7 @@ def write_readme() -> None:
         "",
         f"Made by `python benchmarks/distributed.py`: `{' '.join(SETTINGS)}`,",
         "two workers, one thread per process, one run at a time. Return: mean of an evaluation of 10 episodes, over",
-        "the seeds and each of them. Ages: mean over the rows of `train.csv`; one process plans with the newest weights.",
+        "the seeds and each of them. Ages: mean over the rows of `train.csv`; one process plans with newest weights.",
         "Decisions per second are those of acting and updating, without the random phase. **Load** is the number of",
         f"processes that wanted one of the {os.cpu_count()} cores (mean of 15 minutes, other work included). If",
         "it is well above what the run itself starts, the machine was shared: then speeds and wall times, compilation",

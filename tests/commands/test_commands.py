@@ -61,7 +61,7 @@ def test_the_sdist_holds_the_checkout():
     assert tops - set(manifest) <= {"MANIFEST.in", "pyproject.toml"}  # these two are always there
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate", "export", "report"])
+@pytest.mark.parametrize("name", ["train", "distributed", "evaluate", "export", "report"])
 def test_every_command_has_a_help_that_says_what_it_takes(run_command, name):
     message, out, err = run_command(name, "--help")
     assert message in (None, 0)
@@ -74,9 +74,10 @@ def test_without_a_command_the_commands_are_listed(run_command):
     for arguments in ((), ("--help",)):
         message, out, _ = run_command(*arguments)
         assert message == (0 if arguments else 2)
-        assert all(name in out for name in ("train", "evaluate", "export", "report"))
+        assert all(name in out for name in ("train", "distributed", "evaluate", "export", "report"))
     assert run_command("--version") == (0, f"torchrl-etdmpc {__version__}\n", "")
-    assert run_command("tran")[0] == "error: unknown command 'tran'; choose one of train, evaluate, export, report."
+    known = "train, distributed, evaluate, export, report"
+    assert run_command("tran")[0] == f"error: unknown command 'tran'; choose one of {known}."
 
 
 @pytest.mark.parametrize(

@@ -69,9 +69,9 @@ class DistributedConfig(TrainConfig):
         return self.rows_per_batch
 
 
-def is_distributed(settings: Mapping[str, Any]) -> bool:
+def is_distributed(settings: Any) -> bool:
     """Whether stored settings are those of a run of workers."""
-    return "workers" in settings
+    return isinstance(settings, Mapping) and "workers" in settings
 
 
 class WorkerCollector:
@@ -165,7 +165,9 @@ class WorkerCollector:
 
     def _start(self) -> None:
         config, agent = self.config, self.agent
-        sizes = agent.world_model.observation_dim, agent.world_model.action_dim
+        observation_dim = agent.world_model.observation_dim
+        assert observation_dim is not None  # training takes vectors
+        sizes = observation_dim, agent.world_model.action_dim
         compiled = agent.compile_mode if agent.planner.compiled_plan is not None else None
         parts = WorkerParts(config, sizes, agent.planner.discount, compiled)
         self._numbers = range(self._next_number, self._next_number + config.workers)

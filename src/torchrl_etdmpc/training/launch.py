@@ -180,7 +180,7 @@ def read_run_config(directory: RunDirectory, kind: type[TrainConfig] = TrainConf
         warnings.warn(f"{str(error).rstrip('.')}; the settings are those of {directory.last_agent}.", stacklevel=2)
     else:
         by_workers = is_distributed(values)
-        if by_workers != issubclass(kind, DistributedConfig):
+        if isinstance(values, Mapping) and by_workers != issubclass(kind, DistributedConfig):
             who, command = ("workers", "distributed") if by_workers else ("one process", "train")
             raise ValueError(
                 f"{directory} is a run of {who}; go on with the command {command}, or start a new run_dir."
