@@ -76,7 +76,7 @@ def test_without_a_command_the_commands_are_listed(run_command):
         assert message == (0 if arguments else 2)
         assert all(name in out for name in ("train", "distributed", "evaluate", "export", "report"))
     assert run_command("--version") == (0, f"torchrl-etdmpc {__version__}\n", "")
-    known = "train, distributed, evaluate, export, report"
+    known = "train, distributed, evaluate, export, report, suite"
     assert run_command("tran")[0] == f"error: unknown command 'tran'; choose one of {known}."
 
 
