@@ -15,7 +15,7 @@ import yaml
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig
 from torchrl_etdmpc.commands.export import ExportConfig
 from torchrl_etdmpc.envs import check_env, import_task, make_env
-from torchrl_etdmpc.training import PRESETS, TrainConfig
+from torchrl_etdmpc.training import PRESETS, DistributedConfig, TrainConfig
 from torchrl_etdmpc.training.config import config_from_dict
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -122,7 +122,7 @@ def test_a_command_names_settings_and_options_that_exist(command, own_module, mo
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # the script sets it; this restores it
     runpy.run_path(str(path), run_name="__main__")  # prints the settings and does nothing else
     settings = yaml.safe_load(capsys.readouterr().out)
-    kinds = {"evaluate.py": EvaluateConfig, "export.py": ExportConfig}
+    kinds = {"evaluate.py": EvaluateConfig, "export.py": ExportConfig, "distributed.py": DistributedConfig}
     config_from_dict(kinds.get(path.name, TrainConfig), settings)
 
 
