@@ -49,7 +49,7 @@ class RayCluster:
         try:
             import ray
         except ImportError as error:
-            raise ImportError("engine=ray needs Ray, which is not installed; run: pip install 'ray>=2.60,<3'") from error
+            raise ImportError("engine=ray needs Ray, which is missing; run: pip install 'ray>=2.60,<3'") from error
         self._folder: str | None = None
         quiet: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
         if address is None:
