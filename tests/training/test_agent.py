@@ -222,3 +222,12 @@ def test_an_agent_can_give_up_compilation(compiled, tiny_agent):
     agent.make_eager()
     assert all(getattr(agent, name).compiled_plan is None for name in PLANNERS)
     agent.updater.step(random_slices(OBSERVATION_DIM, ACTION_DIM))
+
+
+def test_every_planner_plans_with_the_averaged_weights_if_asked(tiny_agent):
+    agent = tiny_agent(optim={"average_decay": 0.9})
+    planners = agent.planner, agent.eval_planner, agent.reanalyze_planner
+    assert all(planner.world_model is agent.acting_model for planner in planners)
+    assert agent.acting_model is not agent.world_model
+    plain = tiny_agent()
+    assert plain.planner.world_model is plain.acting_model is plain.world_model

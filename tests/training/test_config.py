@@ -114,6 +114,7 @@ UTD4 = {
     "optim.lr": 3e-4,
     "optim.encoder_lr_scale": 0.3,
     "optim.grad_clip_norm": 20.0,
+    "optim.average_decay": 0.0,
     "replay.capacity": 1_000_000,
     "replay.insertion": "step",
     "replay.uniform_over": "episodes",

@@ -137,6 +137,7 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, st
         {"replay": {"capacity": 30}},
         {"reanalyze": {"every": 0}},
         {"overlap": True},
+        {"optim": {"average_decay": 0.9}},
         {"planner": {"first_action": "mean"}, "eval_policy": True},
     ],
 )

@@ -456,6 +456,32 @@ def test_training_goes_on_bit_for_bit_from_a_saved_state():
     assert [name for name in before if not torch.equal(before[name], after[name])] == []
 
 
+def test_averaged_weights_follow_those_that_are_trained():
+    world_model = make_world_model()
+    updater = Updater(EfficientTDMPCLoss(world_model, discount=0.9, ignore_termination=True), average_decay=0.75)
+    averaged = updater.acting_model
+    expected = {name: parameter.detach().clone() for name, parameter in world_model.named_parameters()}
+    for seed in range(3):
+        seeded_step(updater, make_batch(), seed=seed)
+        for name, parameter in world_model.named_parameters():
+            expected[name] = 0.75 * expected[name] + 0.25 * parameter.detach()
+    for name, parameter in averaged.named_parameters():
+        torch.testing.assert_close(parameter, expected[name])
+        assert not parameter.requires_grad
+        assert not torch.equal(parameter, world_model.get_parameter(name))
+    assert averaged.version == world_model.version == 3
+    again = Updater(EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True), average_decay=0.75)
+    again.load_state_dict(updater.state_dict())
+    assert all(map(torch.equal, again.acting_model.parameters(), averaged.parameters()))
+
+
+def test_without_an_average_the_model_that_is_trained_acts():
+    updater = make_updater()
+    assert updater.acting_model is updater.loss.world_model
+    with pytest.raises(ValueError, match=r"^average_decay must be in \[0, 1\), got 1.0.$"):
+        Updater(updater.loss, average_decay=1.0)
+
+
 def test_the_caller_s_batch_is_left_as_it_is():
     batch = make_batch()
     before = batch.clone()

@@ -91,7 +91,7 @@ def main(config: EvaluateConfig) -> None:
         policy = agent.eval_planner
         env = env.append_transform(policy.make_tensordict_primer())
     else:
-        policy = BarePolicy(agent.world_model)
+        policy = BarePolicy(agent.acting_model)
 
     size = (GIF_SIZE, GIF_SIZE) if str(config.video).endswith(".gif") else ()
     frames: list[torch.Tensor] = []

@@ -50,7 +50,7 @@ def main(config: ExportConfig) -> None:
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
     if config.task not in (None, run.task):
         raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
-    model = agent.world_model
+    model = agent.acting_model
     assert model.observation_dim is not None  # training takes vectors
     policy = export_policy(model)
     planner = export_planner(agent.eval_planner, batch_size=config.batch_size)

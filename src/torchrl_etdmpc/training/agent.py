@@ -27,7 +27,7 @@ from torchrl_etdmpc.training.updater import Updater
 
 @dataclass(frozen=True)
 class Agent:
-    """The parts that learn and act; all of them share one world model."""
+    """The parts that learn and act; all of them share one world model, or its average where weights are averaged."""
 
     world_model: WorldModel
     planner: EnsembleMPPIPlanner
@@ -41,6 +41,11 @@ class Agent:
     def device(self) -> torch.device:
         """Where the networks live."""
         return self.world_model.version.device
+
+    @property
+    def acting_model(self) -> WorldModel:
+        """The networks that act: the world model, or its average."""
+        return self.updater.acting_model
 
     def make_eager(self) -> None:
         """Gives up compilation."""
@@ -162,6 +167,7 @@ def build_agent(
         optim = arguments(config.optim, "batch_size", "updates_per_decision")
         updater = Updater(loss, tau=config.loss.tau, compile_mode=compile_mode, **optim)
     common = {"discount": discount, "compile_mode": compile_mode}
-    planner, eval_planner = (build_planner(world_model, config.planner, warm_start=True, **common) for _ in range(2))
-    reanalyze_planner = build_planner(world_model, config.reanalyze, warm_start=False, group="reanalyze", **common)
+    model = updater.acting_model
+    planner, eval_planner = (build_planner(model, config.planner, warm_start=True, **common) for _ in range(2))
+    reanalyze_planner = build_planner(model, config.reanalyze, warm_start=False, group="reanalyze", **common)
     return Agent(world_model, planner, eval_planner, reanalyze_planner, loss, updater, compile_mode)

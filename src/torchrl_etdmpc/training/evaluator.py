@@ -61,7 +61,7 @@ class Evaluator:
             result = EvaluationResult(returns.mean().item(), returns.std(correction=0).item(), len(returns))
             if not self.with_policy:
                 return result
-            bare = self._play(BarePolicy(self.agent.world_model), on_step)
+            bare = self._play(BarePolicy(self.agent.acting_model), on_step)
         return result._replace(policy_return=bare.mean().item())
 
     def _play(self, policy: nn.Module, on_step: Callable[[TensorDictBase], None] | None) -> Tensor:

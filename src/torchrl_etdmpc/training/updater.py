@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -44,8 +45,14 @@ class Updater:
         encoder_lr_scale (float): factor of the encoder's learning rate. Default: 0.3.
         grad_clip_norm (float): largest gradient norm of the model and of the policy. Default: 20.
         tau (float): rate of the target values. Default: 0.01.
+        average_decay (float): of averaged weights to plan with, per update; below 1. Not in the thesis. Default: 0,
+            no average.
         compile_mode (str, optional): ``torch.compile`` mode of loss and clipped gradient, one graph. Default: ``None``,
             eager. An update without distillation is always eager: pretraining is short.
+
+    Attributes:
+        acting_model (nn.Module): what a planner should plan with: a copy of the loss's world model with the averaged
+            weights, or that world model itself.
 
     Raises:
         ValueError: if an argument is out of range, or parameters differ in dtype or device.
@@ -66,6 +73,7 @@ class Updater:
         encoder_lr_scale: float = 0.3,
         grad_clip_norm: float = 20.0,
         tau: float = 0.01,
+        average_decay: float = 0.0,
         compile_mode: str | None = None,
     ) -> None:
         for name, number in {"lr": lr, "grad_clip_norm": grad_clip_norm}.items():
@@ -75,11 +83,16 @@ class Updater:
             raise ValueError(f"encoder_lr_scale must not be negative, got {encoder_lr_scale}.")
         if not 0 <= tau <= 1:
             raise ValueError(f"tau must be in [0, 1], got {tau}.")
+        if not 0 <= average_decay < 1:
+            raise ValueError(f"average_decay must be in [0, 1), got {average_decay}.")
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
         # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
         SoftUpdate(loss, tau=min(tau, 0.5))
+        self.average_decay = average_decay
+        model = loss.world_model
+        self.acting_model = copy.deepcopy(model).requires_grad_(False) if average_decay else model
         self.parts = _parts(loss)
         self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         values = dict(loss.value_params.flatten_keys(".").items())
@@ -145,7 +158,16 @@ class Updater:
         self.skipped_in_a_row.add_(1).mul_(skipped)
         self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
         self.loss.world_model.version += 1
+        self._average()
         return TensorDict(metrics, batch_size=[]).clone()
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        model, averaged = self.loss.world_model, self.acting_model
+        if averaged is not model:
+            torch._foreach_lerp_(list(averaged.parameters()), list(model.parameters()), 1 - self.average_decay)
+            for mine, newest in zip(averaged.buffers(), model.buffers(), strict=True):
+                mine.copy_(newest)  # the version, by which plans are dated
 
     def warm_up(self, batch: TensorDictBase) -> None:
         """Compiles on a batch of the shapes to come; weights, running scale and optimiser stay as they are.
@@ -209,15 +231,19 @@ class Updater:
         return {part: _joined([next(every) for _ in self.parts[part]]) for part in parts}
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the optimiser and the counts of skipped updates (the weights belong to the loss)."""
-        counts = {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
-        return {"optimizer": self.optimizer.state_dict()} | counts
+        """State of the optimiser, averaged weights, and the counts of skipped updates (the weights are the loss's)."""
+        state = {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
+        if self.average_decay:
+            state["averaged"] = self.acting_model.state_dict()
+        return {"optimizer": self.optimizer.state_dict()} | state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`."""
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
+        if self.average_decay:
+            self.acting_model.load_state_dict(state_dict["averaged"])
 
 
 def _parts(loss: LatentRolloutLoss) -> dict[str, list[nn.Parameter]]:
