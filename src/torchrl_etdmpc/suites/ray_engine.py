@@ -1,0 +1,164 @@
+"""The runs of an experiment on Ray: on a cluster of this machine alone, or on one that is there already."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from torchrl_etdmpc.runs import first_line
+from torchrl_etdmpc.suites.attempt import start
+from torchrl_etdmpc.suites.experiment import Run
+from torchrl_etdmpc.suites.run_queue import RunQueue
+from torchrl_etdmpc.training.signals import StopSignals
+
+_POLL_S = 0.2
+_REACH_S = 10.0  # for an address to answer
+_LOST = -9  # of a run whose node or worker is gone, as if it had been killed
+
+
+def run_on_ray(
+    queue: RunQueue,
+    *,
+    address: str | None = None,
+    workers: int | None = None,
+    cpus_per_run: float = 1.0,
+    gpus_per_run: float | None = None,
+) -> bool:
+    """Trains what is not finished as Ray tasks, until all are or have failed; the rules are those of ``run_locally``.
+
+    A run whose node or worker process dies is begun again on whichever node has room, and goes on from its directory:
+    the folder of the runs must be the same on all nodes, and its file system must have locks. So must be the path of
+    the Python environment.
+
+    Args:
+        queue (RunQueue): the runs.
+
+    Keyword Args:
+        address (str, optional): of a cluster, ``"host:6379"`` or ``"auto"``. Default: one is made of this machine and
+            ends with this process.
+        workers (int, optional): runs at a time. Default: as many as the cluster has room for.
+        cpus_per_run (float): cores that Ray sets aside for a run, and its threads. Default: ``1``.
+        gpus_per_run (float, optional): GPUs that Ray sets aside for a run, e.g. ``0.5``. Default: 1 if the cluster has
+            any, else 0.
+
+    Returns:
+        bool: ``False`` if a signal stopped it.
+
+    Raises:
+        ImportError: if Ray is missing.
+        ConnectionError: if there is no cluster at the address.
+        ValueError: if no node has what a run needs.
+    """
+    with StopSignals() as stop, _cluster(address) as ray:
+        stop.nothing_to_save = False
+        has_gpus = ray.cluster_resources().get("GPU", 0) > 0
+        gpus = float(has_gpus) if gpus_per_run is None else gpus_per_run
+        task = ray.remote(num_cpus=cpus_per_run, num_gpus=gpus, max_retries=0)(_train)
+        if not _room(ray, cpus_per_run, gpus):
+            raise ValueError(
+                f"no node of the cluster has {cpus_per_run:g} CPUs and {gpus:g} GPUs; lower cpus_per_run or "
+                "gpus_per_run."
+            )
+        running: dict[Any, Run] = {}
+        try:
+            while not stop.requested and (queue.left or running):
+                room = workers or max(_room(ray, cpus_per_run, gpus), 1)
+                while len(running) < room and (run := queue.next()) is not None:
+                    queue.say(f"{run.name}: is given to the cluster")
+                    running[task.remote(run, max(int(cpus_per_run), 1))] = run
+                ended, _ = ray.wait(list(running), timeout=_POLL_S) if running else ([], None)
+                for reference in ended:
+                    queue.ended(running.pop(reference), _exit_code(ray, reference))
+                pruned = queue.to_be_stopped()
+                for reference, run in running.items():
+                    if run.name in pruned:
+                        ray.cancel(reference)
+                time.sleep(0 if running else _POLL_S)
+        finally:
+            _stop(ray, running, queue)
+    return not stop.requested
+
+
+def _train(run: Run, threads: int) -> int:
+    """Trains a run on the node where this is called; gives its exit code. Cancelled, it saves the run and leaves."""
+    process = start(run, threads=threads)
+    while process.poll() is None:
+        try:
+            time.sleep(_POLL_S)
+        except KeyboardInterrupt:  # of ray.cancel
+            process.terminate()
+            return process.wait()
+    return process.returncode
+
+
+def _exit_code(ray: Any, reference: Any) -> int:
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise RuntimeError(f"a run cannot be started on its node: {first_line(error.cause or error)}") from error
+    except ray.exceptions.RayError:
+        return _LOST
+
+
+def _room(ray: Any, cpus: float, gpus: float) -> int:
+    """Runs that the nodes have room for, together."""
+    total = 0
+    for node in ray.nodes():
+        if node["Alive"]:
+            has = node["Resources"]
+            fits = [int(has.get(kind, 0.0) / need + 1e-9) for kind, need in (("CPU", cpus), ("GPU", gpus)) if need > 0]
+            total += min(fits, default=os.cpu_count() or 1)
+    return total
+
+
+def _stop(ray: Any, running: dict[Any, Run], queue: RunQueue) -> None:
+    """Asks every run to save itself and leave, and waits for it."""
+    if not running:
+        return
+    queue.say(f"stopping: {len(running)} run{'s save themselves' if len(running) > 1 else ' saves itself'}")
+    for reference in running:
+        ray.cancel(reference)
+    ray.wait(list(running), num_returns=len(running))
+
+
+@contextlib.contextmanager
+def _cluster(address: str | None) -> Iterator[Any]:
+    """Ray, connected; silent, and without a word to the network."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError("engine=ray needs Ray; run: pip install 'ray>=2.60,<3'") from error
+    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    if address is None:
+        options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "object_store_memory": 2**27}
+    else:
+        options["address"] = address
+        _require_answer(address)
+    try:
+        ray.init(**options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        where = "a cluster of this machine" if address is None else f"a cluster at address={address}"
+        raise ConnectionError(f"{where} cannot be reached: {first_line(error)}") from error
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _require_answer(address: str) -> None:
+    """Raises ConnectionError if nobody listens there: Ray itself would wait for minutes, or end this process."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon:  # "auto", "local"
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_REACH_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConnectionError(
+            f"no cluster answers at address={address} ({why}); start one with `ray start --head`, or leave address out."
+        ) from error
