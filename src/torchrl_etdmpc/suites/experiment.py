@@ -364,11 +364,12 @@ def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str
 
 def _is_range(values: Mapping[str, Any]) -> bool:
     """Whether a search's entry has two ends in the right order."""
-    low, high, log = values.get("low"), values.get("high"), values.get("log", False)
-    numbers = isinstance(low, int | float) and isinstance(high, int | float) and bool not in (type(low), type(high))
-    return (
-        numbers and low < high and (not log or low > 0) and type(log) is bool and set(values) <= {"low", "high", "log"}
-    )
+    low: Any = values.get("low")
+    high: Any = values.get("high")
+    log = values.get("log", False)
+    numbers = all(type(end) in (int, float) for end in (low, high))
+    known = set(values) <= {"low", "high", "log"} and type(log) is bool
+    return numbers and known and low < high and (low > 0 or not log)
 
 
 def _settings(values: Any, what: str) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from torchrl_etdmpc.suites.experiment import Run
 
 State = Literal["finished", "running", "stopped", "waiting", "pruned", "failed"]
 _TAIL_BYTES = 8192
+_PATIENCE_S = 0.5  # with another process that has the index; all it holds can be read again
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ class RunIndex:
 
     def _load(self) -> dict[str, tuple[str, Progress]]:
         try:
-            with contextlib.closing(sqlite3.connect(f"{self.file.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            with contextlib.closing(
+                sqlite3.connect(f"{self.file.absolute().as_uri()}?mode=ro", uri=True, timeout=_PATIENCE_S)
+            ) as database:
                 rows = database.execute(f"SELECT path, stamp, {', '.join(_COLUMNS)} FROM runs").fetchall()
             return {path: (stamp, _progress(values)) for path, stamp, *values in rows}
         except (sqlite3.Error, TypeError, ValueError):  # missing, damaged, of another version
@@ -105,7 +108,7 @@ class RunIndex:
         columns = ("path", "variant", "task", "seed", "stamp", *_COLUMNS)
         for _ in range(2):
             try:
-                with contextlib.closing(sqlite3.connect(self.file, timeout=10)) as database, database:
+                with contextlib.closing(sqlite3.connect(self.file, timeout=_PATIENCE_S)) as database, database:
                     database.execute(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(columns)}, PRIMARY KEY (path))")
                     marks = ", ".join("?" * len(columns))
                     database.executemany(f"INSERT OR REPLACE INTO runs ({', '.join(columns)}) VALUES ({marks})", rows)

@@ -37,10 +37,10 @@ class Trials(Protocol):
 
 
 class Retries:
-    """How often a run is tried again: without limit while it gets on, ``most`` times without getting on.
+    """How often a run is tried again: without limit while it gets further, ``most`` times without.
 
     Args:
-        most (int): tries after the first one.
+        most (int): tries after one that did not get further than those before it.
     """
 
     def __init__(self, most: int) -> None:
@@ -51,7 +51,7 @@ class Retries:
         """Whether a run that ended unfinished is to be tried again."""
         steps = read_progress(run).env_steps
         before, tries = self._tries.get(run.name, (0, 0))
-        tries = 1 if steps > before else tries + 1
+        tries = 0 if steps > before else tries + 1
         self._tries[run.name] = (max(steps, before), tries)
         return tries <= self.most
 
