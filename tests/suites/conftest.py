@@ -106,11 +106,14 @@ if kind == "kill":
 
 
 @pytest.fixture
-def stand_in(monkeypatch) -> Callable[[dict[str, list[tuple[str, int]]]], None]:
+def stand_in(monkeypatch, tmp_path_factory) -> Callable[[dict[str, list[tuple[str, int]]]], None]:
     """Makes runs do what is told, try by try: ``finish``, ``fail``, ``kill`` or ``wait`` after so many env steps.
 
     By a word of the run's name; ``{"": [("finish", 400)]}`` is for all others. The last one is repeated.
     """
+
+    script = tmp_path_factory.mktemp("stand_in") / "train.py"
+    script.write_text(STAND_IN)
 
     def behave(plans: dict[str, list[tuple[str, int]]]) -> None:
         plans = {"": [("finish", 400)]} | plans
@@ -118,15 +121,8 @@ def stand_in(monkeypatch) -> Callable[[dict[str, list[tuple[str, int]]]], None]:
         def command(run: Run, **more) -> list[str]:
             plan = next(plan for word, plan in reversed(plans.items()) if word in run.name)
             run.path.mkdir(parents=True, exist_ok=True)
-            return [
-                sys.executable,
-                "-S",
-                "-c",
-                STAND_IN,
-                str(run.path),
-                str(run.config.total_env_steps),
-                json.dumps(plan),
-            ]
+            arguments = [str(run.path), str(run.config.total_env_steps), json.dumps(plan)]
+            return [sys.executable, "-S", str(script), *arguments]
 
         monkeypatch.setattr(attempt, "command", command)
 

@@ -74,7 +74,7 @@ def write_slurm_script(
         Path: of the script.
 
     Raises:
-        ValueError: if ``sbatch`` is not a list of options.
+        ValueError: if ``sbatch`` is not a list of options, or a path holds a line break.
         OSError: if the folder cannot be written.
     """
     try:
@@ -96,6 +96,8 @@ def write_slurm_script(
     script, commands = folder / "slurm.sh", folder / "slurm.txt"
     threads = " threads=${SLURM_CPUS_PER_TASK:-1}"  # for a run whose settings leave them open
     lines = [shlex.join([str(log_file(run)), *command(run)]) + threads * (run.config.threads is None) for run in runs]
+    if any("\n" in line for line in lines):
+        raise ValueError("a path or a setting holds a line break, which slurm.txt cannot; choose another runs_dir.")
     body = _BODY.format(
         title=title,
         count=len(runs),
