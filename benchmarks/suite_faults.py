@@ -93,9 +93,12 @@ def processes_of(run: Run) -> list[int]:
 
 
 def kill_run(run: Run) -> bool:
+    """Whether there was a process to be killed; it is gone afterwards, and the next one still has its imports to do."""
     for process in processes_of(run):
         with contextlib.suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL)
+            while RunDirectory(run.path).in_use:
+                time.sleep(0.01)
             return True
     return False
 
@@ -103,6 +106,10 @@ def kill_run(run: Run) -> bool:
 def learning(runs: list[Run]) -> list[Run]:
     """Runs that have made steps and have a process."""
     return [run for run in runs if read_progress(run).state == "running" and read_progress(run).env_steps > 0]
+
+
+def ended(runs: list[Run]) -> int:
+    return sum(read_progress(run).state == "finished" for run in runs)
 
 
 def checkpoints(run: Run) -> list[Path]:
@@ -176,7 +183,10 @@ def disturb(
     process = start_suite(file, runs_dir, *more)
     # In an order that holds for all: a kill of the suite after every second kill of a run.
     while len(done["run_kills"]) < run_kills or done["suite_kills"] < suite_kills:
-        if time.monotonic() > deadline or not wait_for(lambda: learning(good), process):
+        faults = done["suite_kills"] + len(done["run_kills"])  # spread over the time that all runs take
+        if time.monotonic() > deadline or not wait_for(
+            lambda n=faults: learning(good) and n // 2 <= ended(good), process
+        ):
             process.kill()
             raise RuntimeError(f"the suite ended too early; raise --steps: {runs_dir.with_suffix('.log').read_text()}")
         time.sleep(chance.uniform(0.0, 3.0))
@@ -190,7 +200,7 @@ def disturb(
             steps = read_progress(run).env_steps
             if kill_run(run):
                 done["run_kills"].append(f"{run.name} at {steps} env steps")
-                if done["damaged"] is None and len(checkpoints(run)) > 1 and not RunDirectory(run.path).in_use:
+                if done["damaged"] is None and len(checkpoints(run)) > 1:
                     done["damaged"] = damage(run, chance)
                 print(done["run_kills"][-1], done["damaged"], flush=True)
         elif nodes is not None and not done["node_kills"]:
