@@ -152,7 +152,7 @@ def small() -> SimpleNamespace:
     )
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def humanoid_tasks():
     """Stand-ins where HumanoidBench's tasks are not known."""
     missing = [name for name in HUMANOIDBENCH_HARD if name not in tasks._tasks]

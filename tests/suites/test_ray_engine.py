@@ -157,15 +157,17 @@ def test_a_cluster_without_room_for_a_run_is_named(fake, small, tmp_path):
         run_on_ray(RunQueue(small.experiment().runs(tmp_path)), cpus_per_run=4.0)
 
 
-def test_a_node_that_cannot_write_the_folder_is_named(fake, small, tmp_path, monkeypatch):
-    fake({"CPU": 1.0})
+def test_a_node_that_cannot_begin_a_run_is_tried_again_and_named(fake, small, tmp_path, monkeypatch):
+    ray = fake({"CPU": 1.0})
 
     def train(run, threads):
         raise RayTaskError
 
     monkeypatch.setattr(ray_engine, "_train", train)
-    with pytest.raises(RuntimeError, match="a run cannot be started on its node: No space left on device"):
-        run_on_ray(RunQueue(small.experiment().runs(tmp_path)))
+    (run,) = small.experiment().runs(tmp_path)
+    assert run_on_ray(RunQueue([run], retries=1))
+    assert ray.given == [run.name] * 2
+    assert read_progress(run).error.startswith("cannot be started: No space left on device")
 
 
 def test_an_address_where_nobody_answers_is_named_at_once(small, tmp_path):

@@ -79,6 +79,16 @@ def test_getting_as_far_as_ever_is_not_getting_on(small, tmp_path):
     assert answers == [True, True, True, False]
 
 
+def test_a_finished_run_that_cannot_be_read_is_named(queue_of, small):
+    queue = queue_of(retries=0)
+    run = queue.next()
+    run.path.mkdir(parents=True)
+    (run.path / "summary.json").write_text("{")
+    queue.ended(run, 0)
+    assert read_progress(run).error == "it is finished, but its tables cannot be read"
+    assert queue.next() is None
+
+
 def test_a_run_that_cannot_be_started_is_tried_again_later(queue_of, monkeypatch, said):
     monkeypatch.setattr(run_queue, "_LOOK_AGAIN_S", 0.0)
     queue = queue_of(retries=1)

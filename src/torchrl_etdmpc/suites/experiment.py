@@ -207,12 +207,13 @@ class Experiment:
             for point in search.points():
                 for task in self.tasks:
                     self._config(name, {**search.settings, **point}, task, self.seeds[0])
-        runs = [
-            Run(variant, task, seed, folder / variant / _folder(task) / f"seed{seed}", self.config(variant, task, seed))
-            for variant in self.variants
-            for task in self.tasks
-            for seed in self.seeds
-        ]
+        runs = []
+        for variant in self.variants:
+            for task in self.tasks:
+                place, config = folder / variant / _folder(task), self.config(variant, task, self.seeds[0])
+                for seed in self.seeds:
+                    own = dataclasses.replace(config, seed=seed)
+                    runs.append(Run(variant, task, seed, place / f"seed{seed}", own))
         _require(len({run.path for run in runs}) == len(runs), "two tasks must not differ by / and _ alone.")
         return runs
 

@@ -53,7 +53,7 @@ def run_on_ray(
         ConnectionError: if there is no cluster at the address.
         ValueError: if no node has what a run needs.
     """
-    with StopSignals() as stop, _cluster(address) as ray:
+    with _cluster(address) as ray, StopSignals() as stop:  # in this order: Ray has a handler of its own for SIGTERM
         stop.nothing_to_save = False
         has_gpus = ray.cluster_resources().get("GPU", 0) > 0
         gpus = float(has_gpus) if gpus_per_run is None else gpus_per_run
@@ -72,7 +72,7 @@ def run_on_ray(
                     running[task.remote(run, max(int(cpus_per_run), 1))] = run
                 ended, _ = ray.wait(list(running), timeout=_POLL_S) if running else ([], None)
                 for reference in ended:
-                    queue.ended(running.pop(reference), _exit_code(ray, reference))
+                    _take_back(ray, reference, running.pop(reference), queue)
                 pruned = queue.to_be_stopped()
                 for reference, run in running.items():
                     if run.name in pruned:
@@ -86,22 +86,21 @@ def run_on_ray(
 def _train(run: Run, threads: int) -> int:
     """Trains a run on the node where this is called; gives its exit code. Cancelled, it saves the run and leaves."""
     process = start(run, threads=threads)
-    while process.poll() is None:
-        try:
-            time.sleep(_POLL_S)
-        except KeyboardInterrupt:  # of ray.cancel
-            process.terminate()
-            return process.wait()
-    return process.returncode
-
-
-def _exit_code(ray: Any, reference: Any) -> int:
     try:
-        return ray.get(reference)
-    except ray.exceptions.RayTaskError as error:
-        raise RuntimeError(f"a run cannot be started on its node: {first_line(error.cause or error)}") from error
+        while process.poll() is None:
+            time.sleep(_POLL_S)
+    except KeyboardInterrupt:  # of ray.cancel
+        process.terminate()
+    return process.wait()
+
+
+def _take_back(ray: Any, reference: Any, run: Run, queue: RunQueue) -> None:
+    try:
+        queue.ended(run, ray.get(reference))
+    except ray.exceptions.RayTaskError as error:  # the node cannot write the folder, or lacks the package
+        queue.failed_to_begin(run, first_line(error.cause or error))
     except ray.exceptions.RayError:
-        return _LOST
+        queue.ended(run, _LOST)
 
 
 def _room(ray: Any, cpus: float, gpus: float) -> int:

@@ -91,6 +91,7 @@ class RunQueue:
         self._waiting: list[Run] = []
         self._not_before: dict[str, float] = {}
         self._pruned: set[str] = set()
+        self._elsewhere: set[str] = set()  # runs that another process has, or had
         self._next_look = 0.0
         self._add(runs)
 
@@ -102,13 +103,14 @@ class RunQueue:
     def next(self) -> Run | None:
         """A run that no other process has; ``None`` if there is none now."""
         run = self._next()
-        for trials in self._trials if run is None else ():
-            self._add(trials.propose())
-            run = run or self._next()
+        for trials in self._trials:
+            if run is None:
+                self._add(trials.propose())
+                run = self._next()
         return run
 
     def to_be_stopped(self) -> set[str]:
-        """Paths of runs whose trial has ended early."""
+        """Names of the runs whose trial has ended early."""
         if self._trials and time.monotonic() >= self._next_look:
             self._next_look = time.monotonic() + _LOOK_AGAIN_S
             for run in [run for trials in self._trials for run in trials.look()]:
@@ -130,6 +132,8 @@ class RunQueue:
         """
         what, why = end(run, code)
         progress = read_progress(run)
+        if what == "finished" and progress.state != "finished":
+            what, why = "failed", "it is finished, but its tables cannot be read"
         if what == "finished":
             self.say(f"{run.name}: finished, return {progress.latest_return:.1f}")
         elif run.name in self._pruned:
@@ -163,8 +167,9 @@ class RunQueue:
         return None
 
     def _wait_for_it(self, run: Run) -> None:
-        if run.name not in self._not_before:
+        if run.name not in self._elsewhere:
             self.say(f"{run.name}: another process trains it")
+            self._elsewhere.add(run.name)
         self._not_before[run.name] = time.monotonic() + _LOOK_AGAIN_S
         self._waiting.append(run)
 
