@@ -149,7 +149,7 @@ class Nodes:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         from ray.cluster_utils import Cluster
 
-        head = {"num_cpus": 0, "include_dashboard": False, "node_ip_address": "127.0.0.1", "object_store_memory": 2**27}
+        head = {"num_cpus": 0, "include_dashboard": False, "object_store_memory": 2**27}
         self._node = head | {"num_cpus": 1}
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes = [self.cluster.add_node(**self._node) for _ in range(2)]
