@@ -48,7 +48,7 @@ def test_a_file_comes_to_a_run_for_every_task_seed_and_variant(write, tmp_path):
 
 def test_what_is_written_is_read_again(write, tmp_path):
     search = {"search": {"optim.lr": {"low": 1e-4, "high": 3e-3, "log": True}, "model.mlp_dim": [64, 128]}, "trials": 3}
-    experiment = read_experiment(write(variants={"one": {}, "tuned": search | {"loss.rho": 0.4}}, base="tuned"))
+    experiment = read_experiment(write(variants={"one": {}, "tuned": search | {"loss.rho": 0.4}}, base="one"))
     write_experiment(experiment, tmp_path / "mine.yaml")
     assert read_experiment(tmp_path / "mine.yaml") == experiment
     assert experiment.searches["tuned"].settings == {"loss.rho": 0.4}

@@ -115,7 +115,7 @@ class Experiment:
         searches (mapping): :class:`Search` by the name of the variant that they look for.
         settings (mapping): of all variants; a variant's own come after them.
         budget (int or "benchmark"): env steps of each run, or those of the benchmark that a task belongs to.
-        base (str, optional): the variant that reports compare the others with. Default: the first.
+        base (str, optional): the variant (no search) that reports compare the others with. Default: the first.
         title (str): one line for reports.
         source (str): where the comparison comes from.
 
@@ -147,8 +147,8 @@ class Experiment:
                 f"commas, got {name!r}.",
             )
         _require(
-            self.base is None or self.base in names,
-            f"base of experiment {self.name} must be one of {', '.join(names)}, got {self.base!r}.",
+            self.base is None or self.base in self.variants,
+            f"base of experiment {self.name} must be one of {', '.join(self.variants)}, got {self.base!r}.",
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -165,7 +165,7 @@ class Experiment:
             "budget": self.budget,
             "settings": dict(self.settings),
             "variants": {name: dict(settings) for name, settings in self.variants.items()} | searches,
-            "base": self.base or next(iter([*self.variants, *self.searches])),
+            "base": self.base or next(iter(self.variants), None),
         }
 
     def config(self, variant: str, task: str, seed: int) -> TrainConfig:

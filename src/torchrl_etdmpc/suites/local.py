@@ -54,7 +54,7 @@ def run_locally(queue: RunQueue, *, workers: int | None = None, per_gpu: int = 1
         bool: ``False`` if a signal stopped it.
     """
     gpus = visible_gpus()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     count = workers or len(gpus) * per_gpu or cores
     places = [_Place(gpu=gpus[index % len(gpus)] if gpus else None) for index in range(count)]
     threads = max(cores // count, 1)
@@ -72,6 +72,11 @@ def run_locally(queue: RunQueue, *, workers: int | None = None, per_gpu: int = 1
         finally:
             _stop([place for place in places if place.process is not None], queue)
     return not stop.requested
+
+
+def usable_cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def visible_gpus() -> list[str]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import socket
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -12,11 +10,12 @@ from typing import Any
 from torchrl_etdmpc.runs import first_line
 from torchrl_etdmpc.suites.attempt import start
 from torchrl_etdmpc.suites.experiment import Run
+from torchrl_etdmpc.suites.local import usable_cores
 from torchrl_etdmpc.suites.run_queue import RunQueue
+from torchrl_etdmpc.training.ray_cluster import RayCluster
 from torchrl_etdmpc.training.signals import StopSignals
 
 _POLL_S = 0.2
-_REACH_S = 10.0  # for an address to answer
 _LOST = -9  # of a run whose node or worker is gone, as if it had been killed
 
 
@@ -50,10 +49,10 @@ def run_on_ray(
 
     Raises:
         ImportError: if Ray is missing.
-        ConnectionError: if there is no cluster at the address.
-        ValueError: if no node has what a run needs.
+        OSError: if there is no cluster at the address.
+        ValueError: if the address is none, or no node has what a run needs.
     """
-    with _cluster(address) as ray, StopSignals() as stop:  # in this order: Ray has a handler of its own for SIGTERM
+    with _cluster(address) as ray, StopSignals() as stop:
         stop.nothing_to_save = False
         has_gpus = ray.cluster_resources().get("GPU", 0) > 0
         gpus = float(has_gpus) if gpus_per_run is None else gpus_per_run
@@ -110,7 +109,7 @@ def _room(ray: Any, cpus: float, gpus: float) -> int:
         if node["Alive"]:
             has = node["Resources"]
             fits = [int(has.get(kind, 0.0) / need + 1e-9) for kind, need in (("CPU", cpus), ("GPU", gpus)) if need > 0]
-            total += min(fits, default=os.cpu_count() or 1)
+            total += min(fits, default=usable_cores())
     return total
 
 
@@ -126,38 +125,8 @@ def _stop(ray: Any, running: dict[Any, Run], queue: RunQueue) -> None:
 
 @contextlib.contextmanager
 def _cluster(address: str | None) -> Iterator[Any]:
-    """Ray, connected; silent, and without a word to the network."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
+    """Ray, connected."""
+    with contextlib.closing(RayCluster(address, workers=usable_cores() if address is None else 1)):
         import ray
-    except ImportError as error:
-        raise ImportError("engine=ray needs Ray; run: pip install 'ray>=2.60,<3'") from error
-    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
-    if address is None:
-        options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "object_store_memory": 2**27}
-    else:
-        options["address"] = address
-        _require_answer(address)
-    try:
-        ray.init(**options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        where = "a cluster of this machine" if address is None else f"a cluster at address={address}"
-        raise ConnectionError(f"{where} cannot be reached: {first_line(error)}") from error
-    try:
+
         yield ray
-    finally:
-        ray.shutdown()
-
-
-def _require_answer(address: str) -> None:
-    """Raises ConnectionError if nobody listens there: Ray itself would wait for minutes, or end this process."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not colon:  # "auto", "local"
-        return
-    try:
-        socket.create_connection((host, int(port)), timeout=_REACH_S).close()
-    except (OSError, ValueError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise ConnectionError(
-            f"no cluster answers at address={address} ({why}); start one with `ray start --head`, or leave address out."
-        ) from error
