@@ -178,6 +178,7 @@ def test_a_job_that_is_cancelled_saves_itself_and_stays_away(stand_in_script, su
 def test_a_real_run_that_is_signalled_goes_on_to_the_end_of_one_left_alone(small, tmp_path, submit):
     evaluated = []
     for name, signalled in (("alone", False), ("signalled", True)):
+        (tmp_path / name).mkdir()
         (run,) = small.experiment(budget=600).runs(tmp_path / name)
         script = write_slurm_script([run], tmp_path / name, name)
         process = submit(script, 0)
