@@ -52,6 +52,12 @@ def test_a_whole_experiment_has_nothing_to_name(whole):
     assert incomplete_runs(read(whole)) == []
 
 
+def test_a_search_has_no_runs_of_its_own_but_its_trials_have(whole):
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 1}
+    root = plan(whole, variants={"a": {}, "tuned": search, "tuned trial 0": {"optim.lr": 1e-3}})
+    assert read_experiment(root).variants == ("a", "tuned trial 0")
+
+
 def test_missing_runs_of_an_experiment_are_named(whole):
     root = plan(whole, variants={"a": {}, "b": {"seed": 3}, "c": None}, seeds=[1, 2, 3])
     expected = [("a", 3), ("b", 3), ("c", 1), ("c", 2), ("c", 3)]

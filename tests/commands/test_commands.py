@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
 import signal
 import subprocess
@@ -39,7 +38,7 @@ def run_command(monkeypatch, capsys):
 
 def test_the_wheel_s_command_is_the_examples_code():
     assert PROJECT["project"]["scripts"] == {"torchrl-etdmpc": "torchrl_etdmpc.commands:main"}
-    for name in ("train", "train_dmc", "distributed", "evaluate", "export", "report"):
+    for name in ("train", "train_dmc", "distributed", "evaluate", "export", "report", "suite"):
         assert f'main("{name}")' in (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
 
 
@@ -49,7 +48,8 @@ def test_the_wheel_holds_every_file_that_the_package_reads():
     files = [path.relative_to(package).as_posix() for path in package.rglob("*") if path.is_file()]
     data = [file for file in files if not file.endswith((".py", ".pyc"))]
     assert {"py.typed", "commands/config/train.yaml", "analysis/reference/bmpc.csv"} <= set(data)
-    assert [file for file in data if not any(fnmatch.fnmatch(file, pattern) for pattern in patterns)] == []
+    found = {path.relative_to(package).as_posix() for pattern in patterns for path in package.glob(pattern)}
+    assert sorted(set(data) - found) == []
 
 
 def test_the_sdist_holds_the_checkout():

@@ -56,7 +56,10 @@ def read_experiment(root: Path) -> Experiment:
         values = yaml.load(file.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         tasks = values["tasks"]
         tasks = BENCHMARKS[tasks].tasks if isinstance(tasks, str) and tasks in BENCHMARKS else tasks
-        lists = {"variants": (list(values["variants"]), str), "tasks": (tasks, str), "seeds": (values["seeds"], int)}
+        variants = values["variants"]
+        if isinstance(variants, dict):  # a search has no runs of its own; its trials are variants
+            variants = [name for name, settings in variants.items() if "search" not in (settings or {})]
+        lists = {"variants": (list(variants), str), "tasks": (tasks, str), "seeds": (values["seeds"], int)}
         for name, (items, kind) in lists.items():
             if not isinstance(items, list | tuple) or not items or not all(isinstance(item, kind) for item in items):
                 raise ValueError(name)

@@ -77,7 +77,7 @@ def _choose_renderer(command: str, arguments: list[str]) -> None:
     given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
     if command == "evaluate" and given.get("video", "null") != "null":
         os.environ.setdefault("MUJOCO_GL", "egl")
-    elif ":" not in given.get("task", ""):  # a task of the user's own may render inside
+    elif not any(":" in given.get(name, "") for name in ("task", "tasks", "code")):  # one's own task may render inside
         os.environ["MUJOCO_GL"] = "disable"  # whatever it was: without a film, a missing renderer need not hurt
     else:
         os.environ.setdefault("MUJOCO_GL", "disable")

@@ -6,26 +6,32 @@ import dataclasses
 import shlex
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_etdmpc.commands.command_line import nearest, one_line_errors
 from torchrl_etdmpc.commands.settings_help import help_text, settings_of
+from torchrl_etdmpc.envs import import_task
 from torchrl_etdmpc.runs import console
 from torchrl_etdmpc.suites import (
     Experiment,
     Run,
     RunIndex,
+    RunQueue,
+    Sweep,
     extended,
     find_experiment,
     read_experiment,
     run_locally,
+    run_on_ray,
     status_text,
     write_experiment,
+    write_slurm_script,
 )
 from torchrl_etdmpc.suites.attempt import command
-from torchrl_etdmpc.training import EXIT_CODE, TrainConfig, config_from_dict, follow_own_code
+from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, TrainConfig, config_from_dict, follow_own_code
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiments"
 WHAT = """Trains every run of an experiment: tasks x seeds x variants.
@@ -44,8 +50,8 @@ class SuiteConfig:
 
     experiment: str = ""
     """The name of an experiment, or a path to a file like those of `suite list`."""
-    engine: Literal["local"] = "local"
-    """local: processes on this machine."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """local: processes on this machine. ray: tasks of a Ray cluster. slurm: writes an array job to be submitted."""
     runs_dir: str | None = None
     """Folder of the experiment's runs. Default: runs/EXPERIMENT."""
     tasks: str | None = None
@@ -55,9 +61,18 @@ class SuiteConfig:
     variants: str | None = None
     """Some of the experiment's variants, with commas between. Default: all."""
     workers: int | None = None
-    """Runs at a time. Default: per_gpu for each GPU, or one for each core of a machine without."""
+    """Runs at a time. Default: per_gpu for each GPU, or one for each core of a machine without; what a cluster has
+    room for."""
     per_gpu: int = 1
-    """Runs that share a GPU."""
+    """Runs that share a GPU, with engine=local."""
+    address: str | None = None
+    """Of a Ray cluster, HOST:PORT or auto. Default: one of this machine alone, which ends with the command."""
+    cpus_per_run: float = 1.0
+    """Cores that Ray sets aside for a run."""
+    gpus_per_run: float | None = None
+    """GPUs that Ray sets aside for a run, also a fraction. Default: 1 where the cluster has any."""
+    sbatch: str = ""
+    """Options of sbatch with engine=slurm, e.g. "--partition=gpu --gres=gpu:1 --time=12:00:00"."""
     retries: int = 2
     """How often a run is tried again that fails, or is killed, without having got further."""
     code: str | None = None
@@ -66,7 +81,7 @@ class SuiteConfig:
     """Whether to print what would be run, and to change nothing."""
 
     def __post_init__(self) -> None:
-        for name, least in (("workers", 1), ("per_gpu", 1), ("retries", 0)):
+        for name, least in (("workers", 1), ("per_gpu", 1), ("retries", 0), ("cpus_per_run", 0), ("gpus_per_run", 0)):
             number = getattr(self, name)
             if number is not None and number < least:
                 raise ValueError(f"{name} must be at least {least}, got {number}.")
@@ -86,35 +101,95 @@ def main() -> None:
     if words not in ([], ["status"]):
         raise ValueError(f"unknown word {words[0]!r}; a setting is written name=value, --help lists them.")
     config, settings = _read(sys.argv[1:])
-    for path in (config.code or "").split(",") if config.code else []:
-        for setting in ("planner.score", "reanalyze.score", "loss.extra_terms"):
-            follow_own_code(setting, path)
     asked = _experiment(config, settings)
     folder = Path(config.runs_dir or f"runs/{asked.name}").expanduser().absolute()
-    stored = folder / "experiment.yaml"
-    whole = extended(read_experiment(stored), asked, folder) if stored.exists() else asked
-    index, workers = RunIndex(folder / "index.sqlite"), config.workers or 1
+    file = folder / "experiment.yaml"
+    stored = read_experiment(file) if file.exists() else None
+    _import_own_code(config, settings, [asked] if stored is None else [asked, stored])
     if words == ["status"]:
-        if not stored.exists():
+        if stored is None:
             raise FileNotFoundError(f"runs_dir={folder} holds no experiment; begin it, or name its folder.")
-        runs = whole.runs(folder)
-        print(status_text(runs, index.read(runs), workers))
+        runs = stored.runs(folder)
+        print(status_text(runs, RunIndex(folder / "index.sqlite").read(runs), config.workers or 1))
         return
+    whole = asked if stored is None else extended(stored, asked, folder)
     runs = asked.runs(folder)
     if config.dry_run:
-        print(_plan(runs))
+        print(_plan(asked, runs))
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    write_experiment(whole, stored)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_experiment(whole, file)
+    except OSError as error:
+        raise OSError(
+            f"runs_dir={folder} cannot be written ({error.strerror}); choose a folder that you can write to."
+        ) from error
+    if config.engine == "slurm":
+        _write_for_slurm(config, asked, runs, folder)
+        return
+    sys.exit(_carry_out(config, asked, runs, folder))
+
+
+def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: Path) -> int:
+    """Trains until nothing is left, and says where everything is; the command's exit code."""
+    file = folder / "experiment.yaml"
+
+    def keep(variant: str, settings: dict[str, Any]) -> None:
+        known = read_experiment(file)
+        if variant not in known.variants:
+            write_experiment(dataclasses.replace(known, variants={**known.variants, variant: settings}), file)
+
+    sweeps = [Sweep(asked, name, folder, keep) for name in asked.searches]
+    runs = [*runs, *(run for sweep in sweeps for run in sweep.runs())]
+    queue = RunQueue(runs, retries=config.retries, say=_say, trials=sweeps)
     with console():
-        ended = run_locally(runs, workers=config.workers, per_gpu=config.per_gpu, retries=config.retries, say=_say)
-    progress = index.read(runs)
-    print(status_text(runs, progress, workers))
+        if config.engine == "ray":
+            ended = run_on_ray(
+                queue,
+                address=config.address,
+                workers=config.workers,
+                cpus_per_run=config.cpus_per_run,
+                gpus_per_run=config.gpus_per_run,
+            )
+        else:
+            ended = run_locally(queue, workers=config.workers, per_gpu=config.per_gpu)
+    progress = RunIndex(folder / "index.sqlite").read(queue.runs)
+    print(status_text(queue.runs, progress, config.workers or 1))
+    for sweep in sweeps:
+        print(sweep.best())
     if not ended:
         print("stopped; the same command goes on.")
-        sys.exit(EXIT_CODE)
-    if any(entry.state != "finished" for entry in progress):
-        sys.exit(1)
+        return EXIT_CODE
+    return int(any(entry.state not in ("finished", "pruned") for entry in progress))
+
+
+def _write_for_slurm(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: Path) -> None:
+    if asked.searches:
+        raise ValueError("engine=slurm cannot search: the next trial depends on those before it; use local or ray.")
+    progress = RunIndex(folder / "index.sqlite").read(runs)
+    left = [run for run, entry in zip(runs, progress, strict=True) if entry.state != "finished"]
+    if not left:
+        print(f"{asked.name}: all {len(runs)} runs are finished; nothing to do")
+        return
+    options = {"sbatch": config.sbatch, "workers": config.workers, "retries": config.retries}
+    script = write_slurm_script(left, folder, asked.name, **options)
+    print(f"{len(left)} runs; submit them: sbatch {shlex.quote(str(script))}")
+
+
+def _import_own_code(config: SuiteConfig, settings: dict[str, Any], experiments: Iterable[Experiment]) -> None:
+    """Follows the paths to code that the command line holds; a file may only repeat them."""
+    for name, value in settings.items():
+        if isinstance(value, str):
+            follow_own_code(name, value)
+    tasks = {task: experiment for experiment in experiments for task in experiment.tasks}
+    for path in (path for path in f"{config.tasks or ''},{config.code or ''}".split(",") if ":" in path):
+        if path in tasks:
+            told = {**tasks[path].settings, **settings}
+            names = {name: told.get(f"task.{name}", told.get(name)) for name in TASK_SETTINGS}
+            import_task(path, **names)
+        else:
+            for setting in ("planner.score", "reanalyze.score", "loss.extra_terms"):
+                follow_own_code(setting, path)
 
 
 def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
@@ -166,27 +241,36 @@ def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
     experiment = read_experiment(find_experiment(config.experiment, EXPERIMENTS), **changes)
     if not config.variants:
         return experiment
-    chosen = config.variants.split(",")
+    chosen, known = config.variants.split(","), [*experiment.variants, *experiment.searches]
     for name in chosen:
-        if name not in experiment.variants:
-            raise ValueError(f"variants must be some of {', '.join(experiment.variants)}, got {name!r}.")
-    base = experiment.base if experiment.base in chosen else chosen[0]
-    return dataclasses.replace(experiment, variants={name: experiment.variants[name] for name in chosen}, base=base)
+        if name not in known:
+            raise ValueError(f"variants must be some of {', '.join(known)}, got {name!r}.")
+    return dataclasses.replace(
+        experiment,
+        variants={name: settings for name, settings in experiment.variants.items() if name in chosen},
+        searches={name: search for name, search in experiment.searches.items() if name in chosen},
+        base=experiment.base if experiment.base in chosen else None,  # then it is the folder's, if that has one
+    )
 
 
 def _list() -> str:
     lines = []
     for file in sorted(EXPERIMENTS.glob("*.yaml")):
         experiment = read_experiment(file)
-        count = len(experiment.tasks) * len(experiment.seeds) * len(experiment.variants)
+        variants = len(experiment.variants) + sum(search.trials for search in experiment.searches.values())
+        count = len(experiment.tasks) * len(experiment.seeds) * variants
         lines.append(f"{file.stem:24} {count:5} runs  {experiment.title}")
     return "\n".join(lines)
 
 
-def _plan(runs: list[Run]) -> str:
+def _plan(experiment: Experiment, runs: list[Run]) -> str:
     steps = sum(run.config.total_env_steps for run in runs)
     lines = [shlex.join(command(run)[1:]) for run in runs]
-    return "\n".join([*lines, "", f"{len(runs)} runs, {steps:,} env steps"])
+    each = len(experiment.tasks) * len(experiment.seeds)
+    searches = [
+        f"{name}: a search of {search.trials} trials, {each} runs each" for name, search in experiment.searches.items()
+    ]
+    return "\n".join([*lines, "", f"{len(runs)} runs, {steps:,} env steps", *searches])
 
 
 def _say(line: str) -> None:

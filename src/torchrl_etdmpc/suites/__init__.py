@@ -4,6 +4,7 @@ from torchrl_etdmpc.suites.experiment import (
     TASK_SETS,
     Experiment,
     Run,
+    Search,
     extended,
     find_experiment,
     read_experiment,
@@ -11,7 +12,11 @@ from torchrl_etdmpc.suites.experiment import (
 )
 from torchrl_etdmpc.suites.index import Progress, RunIndex, read_progress
 from torchrl_etdmpc.suites.local import run_locally
+from torchrl_etdmpc.suites.ray_engine import run_on_ray
+from torchrl_etdmpc.suites.run_queue import RunQueue
+from torchrl_etdmpc.suites.slurm import write_slurm_script
 from torchrl_etdmpc.suites.status import status_text
+from torchrl_etdmpc.suites.sweep import Sweep
 
 __all__ = [
     "TASK_SETS",
@@ -19,11 +24,16 @@ __all__ = [
     "Progress",
     "Run",
     "RunIndex",
+    "RunQueue",
+    "Search",
+    "Sweep",
     "extended",
     "find_experiment",
     "read_experiment",
     "read_progress",
     "run_locally",
+    "run_on_ray",
     "status_text",
     "write_experiment",
+    "write_slurm_script",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -15,7 +16,11 @@ from torchrl_etdmpc.suites.experiment import Run, flat
 from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, preset
 
 End = Literal["finished", "stopped", "elsewhere", "failed"]
-_FAILED = "suite: failed: "
+Verdict = Literal["failed", "pruned"]
+BEGUN = "suite: begun"
+BELOW_MEDIAN = "below the median of the trials before it"
+FAILED = "suite: failed: "
+_VERDICTS: dict[Verdict, str] = {"failed": FAILED, "pruned": "suite: pruned: "}
 _TAIL_BYTES = 16_384
 
 
@@ -41,7 +46,7 @@ def log_file(run: Run) -> Path:
     return run.path / "suite.log"
 
 
-def start(run: Run, *, threads: int | None = None, gpu: int | None = None) -> subprocess.Popen[bytes]:
+def start(run: Run, *, threads: int | None = None, gpu: str | None = None) -> subprocess.Popen[bytes]:
     """Starts the run's process, in a session of its own: Ctrl-C in the terminal is for the suite, which passes it on.
 
     Args:
@@ -49,7 +54,7 @@ def start(run: Run, *, threads: int | None = None, gpu: int | None = None) -> su
 
     Keyword Args:
         threads (int, optional): for a run whose settings leave them open.
-        gpu (int, optional): the only one that it sees.
+        gpu (str, optional): the only one that it sees, as ``CUDA_VISIBLE_DEVICES`` calls it.
 
     Raises:
         OSError: if the directory cannot be written.
@@ -59,10 +64,10 @@ def start(run: Run, *, threads: int | None = None, gpu: int | None = None) -> su
         more["threads"] = threads
         environment["OMP_NUM_THREADS"] = str(threads)
     if gpu is not None:
-        environment["CUDA_VISIBLE_DEVICES"] = str(gpu)
+        environment["CUDA_VISIBLE_DEVICES"] = gpu
     run.path.mkdir(parents=True, exist_ok=True)
     with open(log_file(run), "ab") as log:
-        log.write(b"suite: begun\n")
+        log.write(f"{BEGUN}\n".encode())
         log.flush()
         return subprocess.Popen(
             command(run, **more),
@@ -74,34 +79,38 @@ def start(run: Run, *, threads: int | None = None, gpu: int | None = None) -> su
         )
 
 
-def end(run: Run, code: int) -> End:
-    """What the end of a run's process means, by its exit code; notes a failure in the log.
+def end(run: Run, code: int) -> tuple[End, str]:
+    """What the end of a run's process means, by its exit code, and why in a line.
 
-    A process that was stopped by a signal, or asked to stop, has not failed.
+    A process that was stopped by a signal, or asked to stop, has not failed; nor has one that found the directory in
+    use.
     """
     directory = RunDirectory(run.path)
+    last = _last_line(log_file(run))
+    if directory.in_use or "is in use by another process" in last:
+        return "elsewhere", "another process trains it"
     if code == 0 and directory.finished:
-        return "finished"
-    last = _last_line(log_file(run))
-    if "is in use by another process" in last:
-        return "elsewhere"
+        return "finished", ""
     if code in (EXIT_CODE, 130) or code < 0 or code - 128 in set(signal.Signals):
-        return "stopped"
-    note_failure(run, last.removeprefix("error: ") or f"exit code {code}")
-    return "failed"
+        return "stopped", f"exit code {code}"
+    return "failed", last.removeprefix("error: ") or f"exit code {code}"
 
 
-def note_failure(run: Run, reason: str) -> None:
-    """Writes into the run's log that it has failed, where :func:`last_failure` finds it."""
-    run.path.mkdir(parents=True, exist_ok=True)
-    with open(log_file(run), "a", encoding="utf-8") as log:
-        log.write(f"{_FAILED}{reason}\n")
+def note(run: Run, verdict: Verdict, why: str) -> None:
+    """Writes into the run's log what was decided about it, where :func:`last_verdict` finds it; not on a full disk."""
+    with contextlib.suppress(OSError):
+        run.path.mkdir(parents=True, exist_ok=True)
+        with open(log_file(run), "a", encoding="utf-8") as log:
+            log.write(f"{_VERDICTS[verdict]}{why}\n")
 
 
-def last_failure(run: Run) -> str | None:
-    """Why the newest process of a run failed, if it did."""
+def last_verdict(run: Run) -> tuple[Verdict, str] | None:
+    """What was decided about a run, and why, if no process of it began later."""
     last = _last_line(log_file(run))
-    return last.removeprefix(_FAILED) if last.startswith(_FAILED) else None
+    for verdict, beginning in _VERDICTS.items():
+        if last.startswith(beginning):
+            return verdict, last.removeprefix(beginning)
+    return None
 
 
 def _last_line(file: Path) -> str:

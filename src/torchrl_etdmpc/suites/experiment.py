@@ -27,6 +27,15 @@ _FILE_BYTES = 2**20
 _THE_SUITES_OWN = ("task", "seed", "run_dir", "resume")
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML in which ``1e-3`` is a number: PyYAML takes it for text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
 @dataclass(frozen=True)
 class Run:
     """One run of an experiment.
@@ -52,6 +61,48 @@ class Run:
 
 
 @dataclass(frozen=True)
+class Search:
+    """A variant some of whose settings are looked for: each proposal is a trial, on all tasks and seeds.
+
+    Args:
+        space (mapping): by the name of a setting the values to choose from, ``[64, 128]``, or their range,
+            ``{"low": 1e-4, "high": 3e-3, "log": True}``; a range between whole numbers holds whole numbers.
+        trials (int): how many are made.
+        settings (mapping): those that all trials share.
+        prune (bool): whether a trial ends early whose return is below the median of those before it, at the same step.
+
+    Raises:
+        ValueError: if the space is empty, or an entry is neither.
+    """
+
+    space: Mapping[str, Any]
+    trials: int
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    prune: bool = True
+
+    def __post_init__(self) -> None:
+        _require(bool(self.space), "search must name at least one setting, got none.")
+        _require(type(self.trials) is int and self.trials > 0, f"trials must be a number, got {self.trials!r}.")
+        _require(type(self.prune) is bool, f"prune must be true or false, got {self.prune!r}.")
+        for name, values in self.space.items():
+            known = name not in _THE_SUITES_OWN and name != "preset"
+            _require(known, f"search cannot look for {name}; make a variant for each.")
+            _require(
+                _is_range(values) if isinstance(values, Mapping) else isinstance(values, list) and bool(values),
+                f"search of {name} must be a list of values or low and high, with log: true or not, got {values!r}.",
+            )
+
+    def points(self) -> list[dict[str, Any]]:
+        """Every value of a list and both ends of a range, one at a time: if these can be trained, all can."""
+        ends = {
+            name: [values["low"], values["high"]] if isinstance(values, Mapping) else values
+            for name, values in self.space.items()
+        }
+        first = {name: values[0] for name, values in ends.items()}
+        return [first | {name: value} for name, values in ends.items() for value in values]
+
+
+@dataclass(frozen=True)
 class Experiment:
     """What is to be compared on what.
 
@@ -61,9 +112,10 @@ class Experiment:
         seeds (tuple of int): each task is trained with each of them.
         variants (mapping): settings by the name of the variant, e.g. ``{"one head": {"model.num_dynamics": 1}}``;
             ``preset`` may be one of them.
+        searches (mapping): :class:`Search` by the name of the variant that they look for.
         settings (mapping): of all variants; a variant's own come after them.
         budget (int or "benchmark"): env steps of each run, or those of the benchmark that a task belongs to.
-        base (str, optional): the variant that reports compare the others with. Default: the first.
+        base (str, optional): the variant (no search) that reports compare the others with. Default: the first.
         title (str): one line for reports.
         source (str): where the comparison comes from.
 
@@ -75,6 +127,7 @@ class Experiment:
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     variants: Mapping[str, Mapping[str, Any]]
+    searches: Mapping[str, Search] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     budget: int | Literal["benchmark"] = "benchmark"
     base: str | None = None
@@ -82,15 +135,16 @@ class Experiment:
     source: str = ""
 
     def __post_init__(self) -> None:
-        for what in ("tasks", "seeds", "variants"):
-            entries = list(getattr(self, what))
+        names = [*self.variants, *self.searches]
+        for what, entries in {"tasks": self.tasks, "seeds": self.seeds, "variants": names}.items():
             _require(bool(entries), f"{what} of experiment {self.name} must not be empty.")
-            doubled = [entry for entry in entries if entries.count(entry) > 1]
+            doubled = [entry for entry in entries if list(entries).count(entry) > 1]
             _require(not doubled, f"{what} of experiment {self.name} must differ, got {doubled[:1]} more than once.")
-        for name in self.variants:
+        for name in names:
             _require(
-                name not in (".", "..") and not set("/\\:=,") & set(name) and name == name.strip(),
-                f"a variant's name becomes a folder's, so it has none of / \\ : = and commas, got {name!r}.",
+                bool(re.fullmatch(r"\w[^/\\:=,]{0,99}", name)) and name.isprintable() and name == name.strip(),
+                f"a variant's name becomes a folder's: it begins with a letter or a digit and has none of / \\ : = and "
+                f"commas, got {name!r}.",
             )
         _require(
             self.base is None or self.base in self.variants,
@@ -99,6 +153,10 @@ class Experiment:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as a file holds them."""
+        searches = {
+            name: {**search.settings, "search": dict(search.space), "trials": search.trials, "prune": search.prune}
+            for name, search in self.searches.items()
+        }
         return {
             "title": self.title,
             "source": self.source,
@@ -106,8 +164,8 @@ class Experiment:
             "seeds": list(self.seeds),
             "budget": self.budget,
             "settings": dict(self.settings),
-            "variants": {name: dict(settings) for name, settings in self.variants.items()},
-            "base": self.base or next(iter(self.variants)),
+            "variants": {name: dict(settings) for name, settings in self.variants.items()} | searches,
+            "base": self.base or next(iter(self.variants), None),
         }
 
     def config(self, variant: str, task: str, seed: int) -> TrainConfig:
@@ -116,9 +174,14 @@ class Experiment:
         Raises:
             ValueError: if a setting is unknown or out of range; the message names the variant.
         """
-        settings = {**self.settings, **self.variants[variant]}
+        return self._config(variant, self.variants[variant], task, seed)
+
+    def _config(self, variant: str, own: Mapping[str, Any], task: str, seed: int) -> TrainConfig:
+        settings = {**self.settings, **own}
         try:
-            values = preset(settings.pop("preset", "efficient-tdmpc")).to_dict()
+            name = settings.pop("preset", "efficient-tdmpc")
+            _require(isinstance(name, str), f"preset must be a name, got {name!r}.")
+            values = preset(name).to_dict()
             settings.setdefault("total_env_steps", self._budget(task))
             for name, value in settings.items():
                 _put(values, name, value)
@@ -135,59 +198,81 @@ class Experiment:
         raise ValueError(f"{task} is of no benchmark, so budget must be a number of env steps.")
 
     def runs(self, folder: Path) -> list[Run]:
-        """Every run, each in a directory of its own below ``folder``: ``variant/task/seedN``.
+        """Every run of the variants, each in a directory of its own below ``folder``: ``variant/task/seedN``.
 
         Raises:
-            ValueError: as :meth:`config` does, before anything is made.
+            ValueError: as :meth:`config` does, also for what a search may propose, before anything is made.
         """
-        return [
-            Run(variant, task, seed, folder / variant / _folder(task) / f"seed{seed}", self.config(variant, task, seed))
-            for variant in self.variants
-            for task in self.tasks
-            for seed in self.seeds
-        ]
+        for name, search in self.searches.items():
+            for point in search.points():
+                for task in self.tasks:
+                    self._config(name, {**search.settings, **point}, task, self.seeds[0])
+        runs = []
+        for variant in self.variants:
+            for task in self.tasks:
+                place, config = folder / variant / _folder(task), self.config(variant, task, self.seeds[0])
+                for seed in self.seeds:
+                    own = dataclasses.replace(config, seed=seed)
+                    runs.append(Run(variant, task, seed, place / f"seed{seed}", own))
+        _require(len({run.path for run in runs}) == len(runs), "two tasks must not differ by / and _ alone.")
+        return runs
 
 
 def read_experiment(file: Path, **changes: Any) -> Experiment:
     """An experiment from its file; ``changes`` take the place of what the file says.
 
+    .. code-block:: yaml
+
+        title: Small networks with a learning rate of their own   # optional, as are source, base and settings
+        tasks: dmc-easy            # a set, or a list: [walker-walk, gym/Hopper-v5]
+        seeds: 3                   # how many (1, 2, 3), or a list: [7, 8]
+        budget: 100000             # env steps of each run, or benchmark
+        settings: {preset: cpu}    # of all variants
+        variants:
+          cpu: {}
+          two heads: {model.num_dynamics: 2}
+          tuned:                   # a search: each trial is a variant, "tuned trial 0" and so on
+            search:
+              optim.lr: {low: 1e-4, high: 3e-3, log: true}
+              model.mlp_dim: [64, 128]
+            trials: 20
+            prune: true            # end a trial early whose return is below the median of those before it
+        base: cpu                  # the one that reports compare the others with
+
     Args:
-        file (Path): YAML with ``tasks`` (a list, or the name of a set such as ``dmc-easy``), ``seeds`` (a list, or how
-            many), ``variants``, and optionally ``settings``, ``budget``, ``base``, ``title`` and ``source``.
+        file (Path): YAML as above.
         **changes: ``tasks`` and ``seeds`` in the same forms; ``settings`` are added to the file's and to every
             variant's, whose own they replace.
 
     Raises:
-        ValueError: if the file cannot be read, or says what it may not: it never names code or directories.
+        ValueError: if the file cannot be read, or says what it may not. It may hold the path of a task or a score of
+            one's own, but only the command line can make this process follow it.
     """
     try:
-        values = yaml.safe_load(read_whole(file, _FILE_BYTES))
-    except (DamagedFileError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        values = yaml.load(read_whole(file, _FILE_BYTES), _Loader)
+    except (DamagedFileError, yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise ValueError(f"{file} is not an experiment: {' '.join(str(error).split())}") from error
     _require(isinstance(values, dict), f"{file} must hold entries such as tasks, seeds and variants.")
     known = {"tasks", "seeds", "variants", "settings", "budget", "base", "title", "source"}
     unknown = sorted(map(str, set(values) - known))
     _require(not unknown, f"{file} has an unknown entry {', '.join(unknown[:1])}; known: {', '.join(sorted(known))}.")
-    variants = values.get("variants") or {}
-    _require(isinstance(variants, dict), f"variants of {file} must be settings by name.")
-    variants = {str(name): _settings(settings, f"variant {name} of {file}") for name, settings in variants.items()}
-    settings = _settings(values.get("settings"), f"settings of {file}")
-    tasks = _tasks(values.get("tasks"), file)
-    _require(not any(":" in task for task in tasks), f"{file} names code in its tasks; give it as tasks=... instead.")
     more = dict(changes.get("settings") or {})
-    budget = more.pop("total_env_steps", values.get("budget", "benchmark"))
+    budget: Any = more.pop("total_env_steps", values.get("budget", "benchmark"))
+    budget = int(budget) if isinstance(budget, float) and budget.is_integer() else budget
     _require(
         budget == "benchmark" or (type(budget) is int and budget > 0),
         f"budget of {file} must be a number of env steps or 'benchmark', got {budget!r}.",
     )
+    variants, searches = _variants(values.get("variants"), more, file)
     return Experiment(
         name=file.stem,
-        tasks=_tasks(changes["tasks"], file) if changes.get("tasks") else tasks,
+        tasks=_tasks(changes.get("tasks") or values.get("tasks"), file),
         seeds=_seeds(changes.get("seeds") or values.get("seeds"), file),
-        variants={name: own | more for name, own in variants.items()},
-        settings=settings | more,
+        variants=variants,
+        searches=searches,
+        settings=_settings(values.get("settings"), f"settings of {file}") | more,
         budget=budget,
-        base=values.get("base"),
+        base=None if values.get("base") is None else str(values["base"]),
         title=str(values.get("title", "")),
         source=str(values.get("source", "")),
     )
@@ -221,11 +306,21 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
     Raises:
         ValueError: if a run that belongs to both would train with other settings; the message names the first.
     """
+    for name, search in asked.searches.items():
+        before = dataclasses.replace(stored.searches.get(name, search), trials=search.trials, prune=search.prune)
+        same = all(getattr(stored, what) == getattr(asked, what) for what in ("tasks", "seeds", "budget"))
+        if name in stored.searches and not (same and before == search):
+            raise ValueError(
+                f"experiment {asked.name} was begun in {folder} with another space, other tasks, seeds or budget for "
+                f"the search {name!r}, whose trials would not compare; choose another runs_dir for the changed one."
+            )
     both = dataclasses.replace(
         asked,
         tasks=tuple(dict.fromkeys((*stored.tasks, *asked.tasks))),
         seeds=tuple(dict.fromkeys((*stored.seeds, *asked.seeds))),
         variants={**stored.variants, **asked.variants},
+        searches={**stored.searches, **asked.searches},
+        base=asked.base or stored.base,
     )
     for variant in stored.variants:
         for task in stored.tasks:
@@ -243,6 +338,39 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
 def write_experiment(experiment: Experiment, file: Path) -> None:
     """Writes what :func:`read_experiment` reads, whole or not at all."""
     write_whole(file, yaml.safe_dump(experiment.to_dict(), sort_keys=False, allow_unicode=True))
+
+
+def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Search]]:
+    """Those with fixed settings, and those that are searched; with what the command adds to each."""
+    _require(given is None or isinstance(given, dict), f"variants of {file} must be settings by name, got {given!r}.")
+    variants: dict[str, dict[str, Any]] = {}
+    searches: dict[str, Search] = {}
+    for name, settings in (given or {}).items():
+        what = f"variant {name} of {file}"
+        if not (isinstance(settings, dict) and "search" in settings):
+            variants[str(name)] = {**_settings(settings, what), **more}
+            continue
+        _require(isinstance(settings["search"], dict), f"{what} must search settings by name.")
+        fixed = dict(settings)
+        space, trials, prune = fixed.pop("search"), fixed.pop("trials", None), fixed.pop("prune", True)
+        shared = {**_settings(fixed, what), **more}
+        both = sorted(set(map(str, space)) & set(shared))
+        _require(not both, f"{what} searches {', '.join(both)}, which is given as well.")
+        try:
+            searches[str(name)] = Search(dict(space), trials, shared, prune)
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from error
+    return variants, searches
+
+
+def _is_range(values: Mapping[str, Any]) -> bool:
+    """Whether a search's entry has two ends in the right order."""
+    low: Any = values.get("low")
+    high: Any = values.get("high")
+    log = values.get("log", False)
+    numbers = all(type(end) in (int, float) for end in (low, high))
+    known = set(values) <= {"low", "high", "log"} and type(log) is bool
+    return numbers and known and low < high and (low > 0 or not log)
 
 
 def _settings(values: Any, what: str) -> dict[str, Any]:

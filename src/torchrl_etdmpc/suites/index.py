@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.suites.attempt import last_failure, log_file
+from torchrl_etdmpc.suites.attempt import last_verdict, log_file
 from torchrl_etdmpc.suites.experiment import Run
 
-State = Literal["finished", "running", "stopped", "failed", "waiting"]
+State = Literal["finished", "running", "stopped", "waiting", "pruned", "failed"]
 _TAIL_BYTES = 8192
+_PATIENCE_S = 0.5  # with another process that has the index; all it holds can be read again
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,12 @@ class Progress:
     """How far one run is.
 
     Args:
-        state (str): ``"finished"``; ``"running"``, in whatever process; ``"stopped"`` on its way; ``"failed"``;
-            ``"waiting"``, not begun.
+        state (str): ``"finished"``; ``"running"``, in whatever process; ``"stopped"`` on its way; ``"waiting"``, not
+            begun; ``"pruned"``, ended early by a search; ``"failed"``.
         env_steps (int): made so far.
         latest_return (float): of its last evaluation; NaN before the first one.
         decisions_per_second (float): lately; NaN if not known.
-        error (str): the last line of a failed run.
+        error (str): the last line of a failed run, or why it was pruned.
     """
 
     state: State
@@ -44,25 +45,25 @@ class Progress:
 def read_progress(run: Run) -> Progress:
     """How far a run is, from its directory alone; a damaged file counts as missing."""
     directory = RunDirectory(run.path)
-    evals, rows = _last_rows(directory.eval), _last_rows(directory.train)
-    latest = _number(evals[-1], "return_mean") if evals else math.nan
-    steps = max((int(_number(row, "env_steps", 0)) for row in (*evals[-1:], *rows[-1:])), default=0)
+    evals, rows = last_rows(directory.eval), last_rows(directory.train)
+    latest = number_of(evals[-1], "return_mean") if evals else math.nan
+    steps = max((whole_of(row, "env_steps") for row in (*evals[-1:], *rows[-1:])), default=0)
     speed = _speed(rows)
     if directory.finished:
         summary = _summary(directory.summary)
-        steps = int(_number(summary, "env_steps", steps))
+        steps = whole_of(summary, "env_steps") or steps
         if steps >= run.config.total_env_steps:
-            return Progress("finished", steps, latest, _number(summary, "decisions_per_second", speed))
+            return Progress("finished", steps, latest, number_of(summary, "decisions_per_second", speed))
     if directory.in_use:
         return Progress("running", steps, latest, speed)
-    error = last_failure(run)
-    if error is not None:
-        return Progress("failed", steps, latest, speed, error)
+    verdict = last_verdict(run)
+    if verdict is not None:
+        return Progress(verdict[0], steps, latest, speed, verdict[1])
     return Progress("stopped" if directory.holds_a_run else "waiting", steps, latest, speed)
 
 
 class RunIndex:
-    """What :func:`read_progress` says of many runs; only those that changed are read again.
+    """What :func:`read_progress` says of many runs; a finished one is read again only if its files changed.
 
     The file can be removed at any time. Where it cannot be used (a read-only folder, a damaged file), all is read from
     the directories.
@@ -81,18 +82,23 @@ class RunIndex:
         for run in runs:
             stamp = _stamp(run)
             before = known.get(str(run.path))
-            if before is not None and before[0] == stamp and before[1].state != "running":
+            # A process that goes on with one that is not finished need not have changed a file yet.
+            if before is not None and before[0] == stamp and before[1].state == "finished":
                 answers.append(before[1])
                 continue
             answers.append(read_progress(run))
-            changed.append((str(run.path), run.variant, run.task, run.seed, stamp, *astuple(answers[-1])))
+            row = (stamp, *astuple(answers[-1]))
+            if before is None or repr(row) != repr((before[0], *astuple(before[1]))):  # in which NaN is NaN
+                changed.append((str(run.path), run.variant, run.task, run.seed, *row))
         if changed:
             self._store(changed)
         return answers
 
     def _load(self) -> dict[str, tuple[str, Progress]]:
         try:
-            with contextlib.closing(sqlite3.connect(f"{self.file.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            with contextlib.closing(
+                sqlite3.connect(f"{self.file.absolute().as_uri()}?mode=ro", uri=True, timeout=_PATIENCE_S)
+            ) as database:
                 rows = database.execute(f"SELECT path, stamp, {', '.join(_COLUMNS)} FROM runs").fetchall()
             return {path: (stamp, _progress(values)) for path, stamp, *values in rows}
         except (sqlite3.Error, TypeError, ValueError):  # missing, damaged, of another version
@@ -102,7 +108,7 @@ class RunIndex:
         columns = ("path", "variant", "task", "seed", "stamp", *_COLUMNS)
         for _ in range(2):
             try:
-                with contextlib.closing(sqlite3.connect(self.file, timeout=10)) as database, database:
+                with contextlib.closing(sqlite3.connect(self.file, timeout=_PATIENCE_S)) as database, database:
                     database.execute(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(columns)}, PRIMARY KEY (path))")
                     marks = ", ".join("?" * len(columns))
                     database.executemany(f"INSERT OR REPLACE INTO runs ({', '.join(columns)}) VALUES ({marks})", rows)
@@ -137,11 +143,11 @@ def _stamp(run: Run) -> str:
     return " ".join(parts)
 
 
-def _last_rows(table: Path) -> list[dict[str, str]]:
+def last_rows(table: Path) -> list[dict[str, str]]:
     """The last whole rows of a table, without reading all of it."""
     try:
         with open(table, "rb") as file:
-            header = file.readline().decode()
+            header = file.readline(_TAIL_BYTES).decode(errors="replace")
             start = max(file.seek(0, os.SEEK_END) - _TAIL_BYTES, len(header))
             file.seek(start)
             text = file.read(_TAIL_BYTES).decode(errors="replace")
@@ -166,12 +172,20 @@ def _speed(rows: Sequence[dict[str, str]]) -> float:
     if len(rows) < 2:
         return math.nan
     first, last = rows[max(len(rows) - 10, 0)], rows[-1]
-    seconds = _number(last, "wall_time_s") - _number(first, "wall_time_s")
-    return (_number(last, "decision_steps") - _number(first, "decision_steps")) / seconds if seconds > 0 else math.nan
+    seconds = number_of(last, "wall_time_s") - number_of(first, "wall_time_s")
+    decisions = number_of(last, "decision_steps") - number_of(first, "decision_steps")
+    return decisions / seconds if seconds > 0 and decisions > 0 else math.nan
 
 
-def _number(row: Any, name: str, default: float = math.nan) -> float:
+def number_of(row: Any, name: str, default: float = math.nan) -> float:
+    """A column of a row; the default if it holds no number."""
     return _float(row.get(name), default)
+
+
+def whole_of(row: Any, name: str) -> int:
+    """A column of a row as a whole number; 0 if it holds none."""
+    value = number_of(row, name, 0.0)
+    return int(value) if math.isfinite(value) else 0
 
 
 def _float(value: Any, default: float = math.nan) -> float:

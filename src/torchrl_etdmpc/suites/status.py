@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import fmean, median
+from typing import get_args
 
 from torchrl_etdmpc.suites.experiment import Run
-from torchrl_etdmpc.suites.index import Progress
+from torchrl_etdmpc.suites.index import Progress, State
 
 _COLUMNS = ("variant", "task", "seeds done", "env steps", "return", "decisions/s", "time left")
 
@@ -48,18 +49,21 @@ def status_text(runs: Sequence[Run], progress: Sequence[Progress], workers: int 
             )
         )
     states = [entry.state for entry in progress]
-    counts = {state: states.count(state) for state in ("finished", "running", "stopped", "waiting", "failed")}
-    said = ", ".join(f"{number} {state}" for state, number in counts.items() if number)
-    at_a_time = counts["running"] or workers
+    said = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
+    at_a_time = states.count("running") or workers
     total = f"{len(runs)} runs: {said}"
     if left_s:
         total += f"; about {duration(left_s / at_a_time)} left with {at_a_time} at a time"
-    failures = [f"failed: {run.name}: {entry.error}" for run, entry in zip(runs, progress, strict=True) if entry.error]
+    failures = [
+        f"failed: {run.name}: {entry.error}"
+        for run, entry in zip(runs, progress, strict=True)
+        if entry.state == "failed"
+    ]
     return "\n".join([*_aligned(rows), "", total, *failures])
 
 
 def _seconds_left(run: Run, entry: Progress, usual: float) -> float:
-    if entry.state in ("finished", "failed"):
+    if entry.state in ("finished", "pruned", "failed"):
         return 0.0
     speed = usual if math.isnan(entry.decisions_per_second) else entry.decisions_per_second
     return (run.config.total_env_steps - entry.env_steps) / run.config.task_spec.action_repeat / speed

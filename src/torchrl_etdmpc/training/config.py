@@ -374,7 +374,7 @@ def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> 
     Raises:
         ValueError: if a key is unknown, or a value has the wrong type or is out of range.
     """
-    hints = typing.get_type_hints(cls)
+    hints = _type_hints(cls)
     unknown = sorted(set(values) - set(hints))
     _require(not unknown, f"unknown setting {prefix}{unknown[0] if unknown else ''}; known: {', '.join(hints)}.")
     converted = {}
@@ -388,9 +388,12 @@ def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> 
     return cls(**converted)
 
 
+_type_hints = functools.cache(typing.get_type_hints)  # which evaluates every annotation anew
+
+
 def _check_types(config: Any, prefix: str = "") -> None:
     """Checks what was not made by :func:`config_from_dict`."""
-    for name, hint in typing.get_type_hints(type(config)).items():
+    for name, hint in _type_hints(type(config)).items():
         value = getattr(config, name)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             _require(isinstance(value, hint), f"{prefix}{name} must be a {hint.__name__}, got {value!r}.")

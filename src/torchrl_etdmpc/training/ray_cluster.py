@@ -66,7 +66,7 @@ class RayCluster:
             self.close()
             where = "a local Ray cluster cannot be started" if address is None else f"address={address} is no cluster"
             text = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise OSError(f"{where} ({text.rstrip('.')}); leave address out for one, or use engine=multi.") from error
+            raise OSError(f"{where} ({text.rstrip('.')}); leave address out for one, or another engine.") from error
         there = int(ray.cluster_resources().get("CPU", 0))
         if there < workers:
             self.close()

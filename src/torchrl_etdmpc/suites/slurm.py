@@ -1,0 +1,113 @@
+"""The runs of an experiment on SLURM: one array job, written to be submitted."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchrl_etdmpc.runs.files import write_whole
+from torchrl_etdmpc.suites.attempt import BEGUN, FAILED, command, log_file
+from torchrl_etdmpc.suites.experiment import Run
+from torchrl_etdmpc.training import EXIT_CODE
+
+# SLURM sends the signal to the script alone (B:), which passes it on; `wait` returns when a trap has run, so it is
+# asked again until the process is gone.
+_BODY = """\
+# {title}: {count} runs, one for each index of the array. A run that is stopped in time saves itself and leaves with
+# exit code {code}: it goes back into the queue, and goes on from its directory.
+set -u
+cd {cwd} || exit 1
+eval "set -- $(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" {commands})"
+log=$1
+shift
+mkdir -p "$(dirname "$log")"
+signal=
+child=
+trap 'signal=USR1; [ -n "$child" ] && kill -USR1 "$child" 2>/dev/null' USR1
+trap 'signal=TERM; [ -n "$child" ] && kill -TERM "$child" 2>/dev/null' TERM  # cancelled: it is saved, and stays away
+export OMP_NUM_THREADS="${{SLURM_CPUS_PER_TASK:-1}}"
+
+tries=0
+while :; do
+    echo "{begun}" >> "$log"
+    "$@" >> "$log" 2>&1 &
+    child=$!
+    code=0
+    wait "$child" || code=$?
+    while kill -0 "$child" 2>/dev/null; do
+        code=0
+        wait "$child" || code=$?
+    done
+    child=
+    [ "$code" -eq 0 ] && exit 0
+    [ "$signal" = TERM ] && exit {code}
+    if [ "$signal" = USR1 ] || [ "$code" -eq {code} ]; then
+        scontrol requeue "$SLURM_JOB_ID"
+        exit {code}
+    fi
+    tries=$((tries + 1))
+    [ "$tries" -gt {retries} ] && break
+done
+echo "{failed}$(tail -n 1 "$log" | sed 's/^error: //')" >> "$log"
+exit "$code"
+"""
+
+
+def write_slurm_script(
+    runs: Sequence[Run], folder: Path, title: str, *, sbatch: str = "", workers: int | None = None, retries: int = 2
+) -> Path:
+    """Writes ``slurm.sh`` and ``slurm.txt``, which holds the log and the command of each index, into a folder.
+
+    Args:
+        runs (sequence of Run): at least one; those that are finished when their turn comes cost seconds.
+        folder (Path): the same on all nodes, as is the path of the Python environment.
+        title (str): name of the job.
+
+    Keyword Args:
+        sbatch (str): options of sbatch, e.g. ``"--partition=gpu --gres=gpu:1 --time=12:00:00"``; ``--signal`` among
+            them replaces ours, which comes 120 s before the end.
+        workers (int, optional): runs at a time. Default: as many as SLURM lets.
+        retries (int): tries of a run that fails, in the job that it has. Default: ``2``.
+
+    Returns:
+        Path: of the script.
+
+    Raises:
+        ValueError: if ``sbatch`` is not a list of options, or a path holds a line break.
+        OSError: if the folder cannot be written.
+    """
+    try:
+        own = shlex.split(sbatch)
+    except ValueError as error:
+        raise ValueError(f"sbatch must hold options such as '--time=12:00:00', got {sbatch!r}.") from error
+    if any(not option.startswith("-") or "\n" in option for option in own):
+        raise ValueError(f"sbatch must hold options written as --name=value, got {sbatch!r}.")
+    at_a_time = f"%{workers}" if workers else ""
+    options = [
+        f"--job-name={title}",
+        f"--array=0-{len(runs) - 1}{at_a_time}",
+        "--requeue",
+        "--open-mode=append",
+        "--signal=B:USR1@120",
+        f"--output={folder / 'slurm-%A_%a.out'}",
+        *own,  # the last of two counts
+    ]
+    script, commands = folder / "slurm.sh", folder / "slurm.txt"
+    threads = " threads=${SLURM_CPUS_PER_TASK:-1}"  # for a run whose settings leave them open
+    lines = [shlex.join([str(log_file(run)), *command(run)]) + threads * (run.config.threads is None) for run in runs]
+    if any("\n" in line for line in lines):
+        raise ValueError("a path or a setting holds a line break, which slurm.txt cannot; choose another runs_dir.")
+    body = _BODY.format(
+        title=title,
+        count=len(runs),
+        cwd=shlex.quote(str(Path.cwd())),
+        commands=shlex.quote(str(commands)),
+        begun=BEGUN,
+        failed=FAILED,
+        retries=retries,
+        code=EXIT_CODE,
+    )
+    write_whole(commands, "\n".join(lines) + "\n")
+    write_whole(script, "\n".join(["#!/bin/bash", *(f"#SBATCH {shlex.quote(option)}" for option in options), body]))
+    return script

@@ -1,0 +1,199 @@
+"""Variants that are looked for: Optuna proposes settings, each proposal is trained like any variant."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+from torchrl_etdmpc.runs import RunDirectory, first_line
+from torchrl_etdmpc.suites.attempt import BELOW_MEDIAN, last_verdict, note
+from torchrl_etdmpc.suites.experiment import Experiment, Run, Search
+from torchrl_etdmpc.suites.index import last_rows, number_of, read_progress, whole_of
+
+if TYPE_CHECKING:
+    import optuna
+
+
+class Sweep:
+    """The trials of one search, remembered in an SQLite file.
+
+    A trial is a variant by the name of ``"{name} trial {number}"``; its value, which is maximised, is the mean over the
+    experiment's tasks and seeds of the last return. After each evaluation that all runs of a trial have reached, their
+    mean is compared with that of the finished trials at the same env step: below the median of five or more, the trial
+    ends (Optuna's ``MedianPruner``). A trial that was running when the process was killed goes on under the same
+    settings; so does, in the next process, one of whose runs was given up.
+
+    Args:
+        experiment (Experiment): that holds the search.
+        name (str): of the search.
+        folder (Path): of the runs; the studies are in its ``sweeps.sqlite``.
+        keep (callable, optional): gets name and settings of a variant before its first run begins.
+
+    Raises:
+        ImportError: if Optuna is missing.
+        ValueError: if the file cannot be read.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        name: str,
+        folder: Path,
+        keep: Callable[[str, dict[str, Any]], None] = lambda name, settings: None,
+    ) -> None:
+        self.experiment, self.name, self.folder = experiment, name, folder
+        self.search: Search = experiment.searches[name]
+        self._keep = keep
+        self._study = _study(folder / "sweeps.sqlite", name, self.search)
+        self._open: dict[int, list[Run]] = {}
+        self._spent = 0
+        for trial in self._study.get_trials(deepcopy=False):
+            self._spent += self._take_up(trial)
+
+    @property
+    def done(self) -> bool:
+        """Whether no trial is open and none will be proposed."""
+        return not self._open and self._spent >= self.search.trials
+
+    def propose(self) -> list[Run]:
+        """The runs of one more trial; none if there are enough."""
+        if self._spent >= self.search.trials:
+            return []
+        import optuna
+
+        # With one seed for all, a search that goes on after a kill would draw its first proposals again.
+        self._study.sampler = optuna.samplers.TPESampler(seed=len(self._study.get_trials(deepcopy=False)))
+        trial = self._study.ask(_distributions(self.search))
+        self._spent += 1
+        return self._begin(trial.number, trial.params)
+
+    def runs(self) -> list[Run]:
+        """Those of the open trials."""
+        return [run for runs in self._open.values() for run in runs]
+
+    def best(self) -> str:
+        """One line on the best trial so far."""
+        from optuna.trial import TrialState
+
+        ended = self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        if not ended:
+            return f"{self.name}: no trial is finished"
+        trial = max(ended, key=lambda one: one.value or 0.0)
+        point = " ".join(f"{name}={value}" for name, value in trial.params.items())
+        return (
+            f"{self.name}: the best of {len(ended)} finished trials is trial {trial.number}, {trial.value:.1f}: {point}"
+        )
+
+    def look(self) -> list[Run]:
+        """Notes how far the open trials are; returns the runs of those that end early."""
+        ended: list[Run] = []
+        for number, runs in list(self._open.items()):
+            last = [read_progress(run) for run in runs]
+            if all(entry.state == "finished" for entry in last):
+                self._tell(number, fmean(entry.latest_return for entry in last))
+            elif self.search.prune and self._should_be_pruned(number, runs):
+                self._tell(number, None)
+                ended += runs
+        return ended
+
+    def give_up(self, run: Run) -> None:
+        """Leaves a trial open whose run cannot be finished now: the next process tries it again."""
+        self._open = {number: runs for number, runs in self._open.items() if run not in runs}
+
+    def _take_up(self, trial: optuna.trial.FrozenTrial) -> bool:
+        """Goes on with a trial of an earlier process; whether it counts as one."""
+        import optuna
+
+        if set(trial.params) != set(self.search.space):  # killed while it was proposed
+            if not trial.state.is_finished():
+                self._tell(trial.number, math.nan)
+            return False
+        if not trial.state.is_finished():
+            self._begin(trial.number, trial.params)
+        elif trial.state == optuna.trial.TrialState.PRUNED:
+            for run in self._runs(trial.number, trial.params):
+                if last_verdict(run) is None and read_progress(run).state != "finished":
+                    note(run, "pruned", BELOW_MEDIAN)
+        return True
+
+    def _begin(self, number: int, point: dict[str, Any]) -> list[Run]:
+        self._keep(self._variant(number), {**self.search.settings, **point})
+        self._open[number] = self._runs(number, point)
+        return self._open[number]
+
+    def _runs(self, number: int, point: dict[str, Any]) -> list[Run]:
+        variants = {self._variant(number): {**self.search.settings, **point}}
+        return dataclasses.replace(self.experiment, variants=variants, searches={}, base=None).runs(self.folder)
+
+    def _variant(self, number: int) -> str:
+        return f"{self.name} trial {number}"
+
+    def _tell(self, number: int, value: float | None) -> None:
+        """Closes a trial: with its value, as failed if that is NaN, as pruned without one."""
+        from optuna.trial import TrialState
+
+        if value is None:
+            self._study.tell(number, state=TrialState.PRUNED)
+        elif math.isnan(value):
+            self._study.tell(number, state=TrialState.FAIL)
+        else:
+            self._study.tell(number, value)
+        self._open.pop(number, None)
+
+    def _should_be_pruned(self, number: int, runs: list[Run]) -> bool:
+        """Reports the evaluations that all runs have reached, but for the last one; asks the pruner if one is new."""
+        import optuna
+
+        frozen = self._study.get_trials(deepcopy=False)[number]
+        trial = optuna.trial.Trial(self._study, frozen._trial_id)
+        curves = [_evaluations(run) for run in runs]
+        reached = set(curves[0]).intersection(*curves[1:]) - set(frozen.intermediate_values)
+        for step in sorted(reached):
+            trial.report(fmean(curve[step] for curve in curves), step)
+        return bool(reached) and trial.should_prune()
+
+
+def _study(file: Path, name: str, search: Search) -> optuna.Study:
+    try:
+        import optuna
+    except ImportError as error:
+        raise ImportError(f"the search for {name!r} needs Optuna; run: pip install 'optuna>=5,<6'") from error
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        return optuna.create_study(
+            storage=f"sqlite:///{file}",
+            study_name=name,
+            direction="maximize",
+            pruner=optuna.pruners.MedianPruner() if search.prune else optuna.pruners.NopPruner(),
+            load_if_exists=True,
+        )
+    except Exception as error:  # SQLAlchemy has dozens
+        raise ValueError(
+            f"{file} cannot be used as a study ({first_line(error)}); remove it to search anew."
+        ) from error
+
+
+def _distributions(search: Search) -> dict[str, optuna.distributions.BaseDistribution]:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    found: dict[str, Any] = {}
+    for name, values in search.space.items():
+        if isinstance(values, list):
+            found[name] = CategoricalDistribution(values)
+        elif isinstance(values["low"], int) and isinstance(values["high"], int):
+            found[name] = IntDistribution(values["low"], values["high"], log=values.get("log", False))
+        else:
+            found[name] = FloatDistribution(values["low"], values["high"], log=values.get("log", False))
+    return found
+
+
+def _evaluations(run: Run) -> dict[int, float]:
+    """Returns by env step, without the one before learning and the one at the end."""
+    rows = [
+        (whole_of(row, "env_steps"), number_of(row, "return_mean")) for row in last_rows(RunDirectory(run.path).eval)
+    ]
+    return {step: value for step, value in rows if 0 < step < run.config.total_env_steps and math.isfinite(value)}

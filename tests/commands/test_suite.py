@@ -1,0 +1,336 @@
+"""The command ``suite``: what it prints, what it refuses, and what it leaves alone."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from torchrl_etdmpc import commands
+from torchrl_etdmpc.commands import suite
+from torchrl_etdmpc.suites import RunQueue, read_experiment
+
+SMALL = {"preset": "cpu", "device": "cpu", "task.episode_length": 200, "replay.seed_decisions": 40}
+MINE = {
+    "tasks": ["cup-catch"],
+    "seeds": 2,
+    "budget": 400,
+    "settings": SMALL,
+    "variants": {"a": {}, "b": {"loss.rho": 0.4}},
+}
+
+
+@pytest.fixture
+def mine(tmp_path):
+    def write(**changes) -> str:
+        file = tmp_path / "mine.yaml"
+        file.write_text(yaml.safe_dump(MINE | changes, sort_keys=False))
+        return str(file)
+
+    return write
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, tmp_path):
+    """Runs ``torchrl-etdmpc suite`` in this process; returns its exit message and what it printed."""
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> tuple[object, str]:
+        monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", "suite", *arguments])
+        message = None
+        try:
+            commands.main()
+        except SystemExit as stop:
+            message = stop.code
+        out, err = capsys.readouterr()
+        assert err == ""
+        return message, out
+
+    return run
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Instead of training: the queues that would have been, and runs that are finished by it."""
+    queues: list[RunQueue] = []
+
+    def run_locally(queue, **places):
+        queues.append(queue)
+        while (run := queue.next()) is not None:
+            run.path.mkdir(parents=True, exist_ok=True)
+            row = f"{run.config.total_env_steps},200,0,9.0"
+            head = "env_steps,decision_steps,updates,wall_time_s"
+            (run.path / "config.yaml").write_text("task: cup-catch\n")
+            (run.path / "train.csv").write_text(f"{head}\n{row}\n")
+            (run.path / "eval.csv").write_text(f"{head},return_mean,return_std,episodes\n{row},321.0,0,1\n")
+            (run.path / "summary.json").write_text(f'{{"env_steps": {run.config.total_env_steps}}}')
+            queue.ended(run, 0)
+        return True
+
+    monkeypatch.setattr(suite, "run_locally", run_locally)
+    return queues
+
+
+def test_the_committed_experiments_are_listed(call):
+    message, out = call("list")
+    assert message is None
+    assert len(out.splitlines()) == len(list(suite.EXPERIMENTS.glob("*.yaml")))
+    assert "dynamics-ensemble           96 runs  Dynamics heads, 1, 2, 4 or 8, added to BMPC" in out.splitlines()
+
+
+def test_the_help_names_every_setting(call):
+    message, out = call("--help")
+    assert message is None
+    for name in (
+        "experiment=",
+        "engine=local",
+        "runs_dir=null",
+        "sbatch=",
+        "address=",
+        "cpus_per_run=1.0",
+        "retries=2",
+    ):
+        assert f"  {name}" in out
+
+
+def test_a_dry_run_says_what_would_be_run_and_changes_nothing(call, mine, tmp_path):
+    message, out = call(f"experiment={mine()}", "dry_run=true", "runs_dir=here")
+    assert message is None
+    lines = out.splitlines()
+    assert len(lines) == 6
+    assert lines[0].startswith("-m torchrl_etdmpc.commands train ")
+    assert f"run_dir={tmp_path}/here/b/cup-catch/seed2" in lines[3]
+    assert "loss.rho=0.4" in lines[3]
+    assert lines[-1] == "4 runs, 1,600 env steps"
+    assert not (tmp_path / "here").exists()
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 7}
+    _, out = call(f"experiment={mine(variants={'tuned': search})}", "dry_run=true")
+    assert out.splitlines()[-1] == "tuned: a search of 7 trials, 2 runs each"
+
+
+def test_an_experiment_is_trained_told_and_grown(call, mine, trained, tmp_path):
+    message, out = call(f"experiment={mine()}", "variants=b", "seeds=1", "runs_dir=here")
+    assert message == 0
+    assert "b/cup-catch/seed1: finished, return 321.0" in out
+    assert out.splitlines()[-1] == "1 runs: 1 finished"
+    message, out = call(f"experiment={mine()}", "runs_dir=here", "total_env_steps=500")
+    assert message == 0
+    assert out.splitlines()[-1] == "4 runs: 4 finished"
+    assert len(trained[1].runs) == 4
+    stored = read_experiment(tmp_path / "here" / "experiment.yaml")
+    assert (list(stored.variants), stored.seeds, stored.budget, stored.base) == (["b", "a"], (1, 2), 500, "b")
+    message, out = call("status", "runs_dir=here")
+    assert message is None
+    assert out.splitlines()[0].startswith("variant  task       seeds done")
+    assert out.splitlines()[-1] == "4 runs: 4 finished"
+
+
+def test_the_base_stays_when_a_command_trains_other_variants(call, mine, trained, tmp_path):
+    call(f"experiment={mine(base='a')}", "runs_dir=here")
+    call(f"experiment={mine(base='a')}", "runs_dir=here", "variants=b")
+    assert read_experiment(tmp_path / "here" / "experiment.yaml").base == "a"
+
+
+def test_the_status_needs_none_of_the_settings_that_it_was_begun_with(call, mine, trained):
+    call(f"experiment={mine()}", "runs_dir=here", "model.num_dynamics=1")
+    message, out = call("status", f"experiment={mine()}", "runs_dir=here")
+    assert message is None
+    assert out.splitlines()[-1] == "4 runs: 4 finished"
+
+
+def test_a_run_that_fails_makes_the_command_fail(call, mine, monkeypatch):
+    def fail(queue, **places):
+        while (run := queue.next()) is not None:
+            run.path.mkdir(parents=True, exist_ok=True)
+            queue.ended(run, 3)
+        return True
+
+    monkeypatch.setattr(suite, "run_locally", fail)
+    message, out = call(f"experiment={mine()}", "seeds=1", "retries=0", "runs_dir=here")
+    assert message == 1
+    assert out.splitlines()[-3:] == [
+        "2 runs: 2 failed",
+        "failed: a/cup-catch/seed1: exit code 3",
+        "failed: b/cup-catch/seed1: exit code 3",
+    ]
+
+
+def test_a_suite_that_is_stopped_says_so_with_the_code_for_later(call, mine, monkeypatch):
+    monkeypatch.setattr(suite, "run_locally", lambda queue, **places: False)
+    message, out = call(f"experiment={mine()}", "runs_dir=here")
+    assert message == 75
+    assert out.splitlines()[-1] == "stopped; the same command goes on."
+
+
+def test_a_search_adds_its_trials_to_the_experiment(call, mine, trained, tmp_path):
+    pytest.importorskip("optuna")
+    search = {"search": {"optim.lr": {"low": 1e-4, "high": 1e-2, "log": True}}, "trials": 2}
+    message, out = call(f"experiment={mine(variants={'a': {}, 'tuned': search})}", "runs_dir=here")
+    assert message == 0
+    stored = read_experiment(tmp_path / "here" / "experiment.yaml")
+    assert [name for name in stored.variants if name.startswith("tuned trial")] == ["tuned trial 0", "tuned trial 1"]
+    assert stored.searches["tuned"].trials == 2
+    _, out = call("status", "runs_dir=here")
+    assert out.splitlines()[-1] == "6 runs: 6 finished"
+    message, out = call(f"experiment={mine(variants={'a': {}, 'tuned': search})}", "runs_dir=here")
+    assert message == 0
+    assert "6 runs: 6 finished" in out
+
+
+def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
+    call(f"experiment={mine()}", "seeds=1", "runs_dir=here")
+    message, out = call(
+        f"experiment={mine()}", "engine=slurm", "runs_dir=here", "sbatch=--time=1:00:00 --mem=8G", "workers=1"
+    )
+    assert message is None
+    script = tmp_path / "here" / "slurm.sh"
+    assert out == f"2 runs; submit them: sbatch {script}\n"
+    assert "#SBATCH --array=0-1%1\n" in script.read_text()
+    assert "#SBATCH --mem=8G\n" in script.read_text()
+    call(f"experiment={mine()}", "runs_dir=here")
+    message, out = call(f"experiment={mine()}", "engine=slurm", "runs_dir=here")
+    assert out == "mine: all 4 runs are finished; nothing to do\n"
+
+
+# -- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["experiment=dynamics-ensmble"],
+            "unknown experiment 'dynamics-ensmble'; did you mean dynamics-ensemble? A path",
+        ),
+        (["experiment=none.yaml"], "experiment=none.yaml is not a file."),
+        ([], "experiment=... is missing: the name of an experiment; `suite list` lists them."),
+        (["status"], "experiment=... is missing"),
+        (["status", "experiment=cpu-easy"], "runs_dir={here}/runs/cpu-easy holds no experiment; begin it, or name its"),
+        (
+            ["stauts", "experiment=cpu-easy"],
+            "unknown word 'stauts'; a setting is written name=value, --help lists them.",
+        ),
+        (["experiment=cpu-easy", "worker=3"], "unknown setting worker; did you mean workers? --help lists all."),
+        (
+            ["experiment=cpu-easy", "planner.horizont=3"],
+            "unknown setting planner.horizont; did you mean planner.horizon",
+        ),
+        (["experiment=cpu-easy", "workers=0"], "workers must be at least 1, got 0."),
+        (["experiment=cpu-easy", "workers=two"], "workers must be of type int, got 'two'."),
+        (["experiment=cpu-easy", "cpus_per_run=-1"], "cpus_per_run must be at least 0, got -1.0."),
+        (["experiment=cpu-easy", "engine=spark"], "engine must be one of local, ray, slurm, got 'spark'."),
+        (
+            ["experiment=cpu-easy", "tasks=walker-wlak"],
+            "variant 'cpu' of experiment cpu-easy: unknown task 'walker-wlak'",
+        ),
+        (
+            ["experiment=cpu-easy", "seeds=x"],
+            "seeds of {experiments}/cpu-easy.yaml must be a list of numbers or how many",
+        ),
+        (["experiment=cpu-easy", "variants=gpu"], "variants must be some of cpu, got 'gpu'."),
+        (
+            ["experiment=cpu-easy", "planner.horizon=x"],
+            "variant 'cpu' of experiment cpu-easy: planner.horizon must be of",
+        ),
+        (["experiment=cpu-easy", "total_env_steps=0"], "budget of {experiments}/cpu-easy.yaml must be a number of env"),
+        (
+            ["experiment=cpu-easy", "engine=slurm", "sbatch=gpu"],
+            "sbatch must hold options written as --name=value, got",
+        ),
+    ],
+)
+def test_bad_input_is_answered_in_a_line(call, tmp_path, arguments, message):
+    code, out = call(*arguments)
+    assert str(code).startswith("error: " + message.format(here=tmp_path, experiments=suite.EXPERIMENTS))
+    assert "\n" not in str(code)
+    assert out == ""
+
+
+def test_a_setting_of_a_variant_that_does_not_exist_is_found_before_anything_starts(call, mine, trained, tmp_path):
+    code, _ = call(f"experiment={mine(variants={'a': {}, 'b': {'optim.lrr': 1}})}", "runs_dir=here")
+    assert code.startswith("error: variant 'b' of experiment mine: unknown setting optim.lrr; known: ")
+    assert trained == []
+    assert not (tmp_path / "here").exists()
+
+
+def test_an_experiment_that_was_changed_is_never_mixed_with_what_it_was(call, mine, trained, tmp_path):
+    call(f"experiment={mine()}", "runs_dir=here")
+    before = (tmp_path / "here" / "experiment.yaml").read_bytes()
+    code, _ = call(f"experiment={mine(variants={'a': {'loss.rho': 0.7}})}", "runs_dir=here")
+    assert code == (
+        f"error: experiment mine was begun in {tmp_path}/here with loss.rho=0.5 for variant 'a', now it is 0.7; choose "
+        "another runs_dir for the changed one."
+    )
+    assert (tmp_path / "here" / "experiment.yaml").read_bytes() == before
+    assert len(trained) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_named(call, mine, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, _ = call(f"experiment={mine()}", "runs_dir=file")
+    assert (
+        code
+        == f"error: runs_dir={tmp_path}/file cannot be written (File exists); choose a folder that you can write to."
+    )
+
+
+def test_a_full_disk_is_named(call, mine, small_disk, leave_free, tmp_path):
+    leave_free(small_disk, 0)
+    code, _ = call(f"experiment={mine()}", f"runs_dir={small_disk}/runs")
+    assert code.startswith(f"error: runs_dir={small_disk}/runs cannot be written (No space left on device); choose a")
+
+
+def test_slurm_cannot_search(call, mine):
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 2}
+    code, _ = call(f"experiment={mine(variants={'tuned': search})}", "engine=slurm", "runs_dir=here")
+    assert code == "error: engine=slurm cannot search: the next trial depends on those before it; use local or ray."
+
+
+@pytest.mark.parametrize(("module", "package"), [("ray", "ray>=2.60,<3"), ("optuna", "optuna>=5,<6")])
+def test_a_missing_extra_is_named_with_its_remedy(call, mine, monkeypatch, module, package):
+    monkeypatch.setitem(sys.modules, module, None)
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 2}
+    variants = {"tuned": search} if module == "optuna" else {"a": {}}
+    code, _ = call(f"experiment={mine(variants=variants)}", "engine=ray", "runs_dir=here")
+    assert code.endswith(f"; run: pip install '{package}'")
+
+
+# -- code of one's own ------------------------------------------------------------------------------------------------
+
+OWN = """
+from torchrl_etdmpc.envs import Task
+task = Task("mine", "dm_control", action_repeat=2, episode_length=1000, terminates=False)
+def score(returns):
+    return returns[..., -1, :, :].mean((-2, -1))
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    name = f"own_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text(OWN.replace('"mine"', '"cup-catch"'))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield name
+    sys.modules.pop(name, None)
+
+
+def test_a_file_cannot_name_code_unless_the_command_line_does(call, mine, trained, own_module):
+    file = mine(settings=SMALL | {"planner.score": f"{own_module}:score"}, tasks=[f"{own_module}:task"])
+    code, _ = call(f"experiment={file}", "runs_dir=here")
+    assert "names code, which must be given on the command line" in code
+    assert own_module not in sys.modules
+    code, out = call(f"experiment={file}", "runs_dir=here", f"code={own_module}:score,{own_module}:task")
+    assert code == 0
+    assert out.splitlines()[-1] == "4 runs: 4 finished"
+
+
+def test_a_task_of_one_s_own_can_be_given_and_gone_on_with(call, mine, trained, own_module):
+    for _ in range(2):
+        code, out = call(f"experiment={mine()}", "runs_dir=here", f"tasks={own_module}:task")
+        assert code == 0
+        assert out.splitlines()[-1] == "4 runs: 4 finished"
+    assert trained[0].runs[0].path.parent == Path.cwd() / "here" / "a" / f"{own_module}_task"

@@ -1,0 +1,144 @@
+"""One run in a process: its command says all of its settings, and its end is understood."""
+
+from __future__ import annotations
+
+import fcntl
+import signal
+import sys
+
+import pytest
+
+from torchrl_etdmpc.commands import suite
+from torchrl_etdmpc.suites import attempt, read_experiment
+from torchrl_etdmpc.suites.attempt import command, end, last_verdict, log_file, note, start
+from torchrl_etdmpc.training import TrainConfig
+
+
+@pytest.fixture
+def parsed(monkeypatch):
+    """What the command line of ``train`` makes of a command."""
+    pytest.importorskip("hydra")
+    from torchrl_etdmpc.commands import train
+
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+
+    def parse(words: list[str]) -> TrainConfig:
+        assert words[:4] == [sys.executable, "-m", "torchrl_etdmpc.commands", "train"]
+        got: list[TrainConfig] = []
+        monkeypatch.setattr(train, "train", got.append)
+        monkeypatch.setattr(sys, "argv", ["torchrl-etdmpc train", *words[4:]])
+        train.main()
+        return got[0]
+
+    return parse
+
+
+def as_asked(run) -> TrainConfig:
+    return TrainConfig.from_dict(run.config.to_dict() | {"run_dir": str(run.path), "resume": "auto"})
+
+
+def assert_parsed_back(name: str, parsed, folder, variants: slice) -> None:
+    runs = read_experiment(suite.EXPERIMENTS / f"{name}.yaml", seeds=[3]).runs(folder / "a folder, 'quoted'")
+    for run in list({run.variant: run for run in runs}.values())[variants]:
+        assert parsed(command(run)) == as_asked(run)
+
+
+@pytest.mark.parametrize("name", ["utd", "cheap-reanalyze", "horizon"])
+def test_the_command_of_a_variant_is_parsed_back_to_its_settings(name, parsed, tmp_path):
+    assert_parsed_back(name, parsed, tmp_path, slice(-1, None))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(file.stem for file in suite.EXPERIMENTS.glob("*.yaml")))
+def test_the_command_of_every_variant_is_parsed_back_to_its_settings(name, parsed, tmp_path):
+    assert_parsed_back(name, parsed, tmp_path, slice(None))
+
+
+def test_settings_of_every_kind_are_parsed_back(parsed, small, tmp_path):
+    variants = {
+        "many": {
+            "task.terminates": True,
+            "task.action_repeat": 4,
+            "checkpoint_minutes": None,
+            "eval_policy": True,
+            "optim.lr": 1.25e-7,
+            "planner.scoring_dtype": "bfloat16",
+            "replay.pretrain_updates": 0,
+            "logger": "tensorboard",
+        }
+    }
+    (run,) = small.experiment(variants=variants).runs(tmp_path)
+    assert parsed(command(run)) == as_asked(run)
+    assert parsed(command(run, threads=3)).threads == 3
+
+
+def test_a_run_begins_in_a_directory_of_its_own_with_its_own_threads_and_gpu(small, tmp_path, monkeypatch):
+    (run,) = small.experiment(settings=small.settings | {"threads": None}).runs(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    told = "import os, sys; print(os.environ['OMP_NUM_THREADS'], os.environ.get('CUDA_VISIBLE_DEVICES'), sys.argv[1:])"
+    monkeypatch.setattr(attempt, "command", lambda run, **more: [sys.executable, "-c", told, *map(str, more.values())])
+    assert start(run, threads=2, gpu="3").wait() == 0
+    assert small.log_of(run) == ["suite: begun", "2 3 ['2']"]
+    (own,) = small.experiment(variants={"own": {"threads": 5}}).runs(tmp_path)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert start(own, threads=2).wait() == 0
+    assert small.log_of(own) == ["suite: begun", "7 None []"]  # it sets them itself
+
+
+def test_the_end_of_a_process_is_understood(small, tmp_path):
+    (run,) = small.experiment().runs(tmp_path)
+    run.path.mkdir(parents=True)
+    log_file(run).write_text("suite: begun\n12:00:00 learning\nerror: the simulator is gone\n")
+    assert end(run, 1) == ("failed", "the simulator is gone")
+    for code in (75, 130, -signal.SIGKILL, 128 + signal.SIGTERM):
+        assert end(run, code) == ("stopped", f"exit code {code}")
+    assert end(run, 0) == ("failed", "the simulator is gone")  # it says that it is done, and there is no summary
+    small.write_finished(run)
+    assert end(run, 0) == ("finished", "")
+    log_file(run).unlink()
+    assert end(run, 3) == ("failed", "exit code 3")
+
+
+def test_a_directory_that_is_in_use_is_no_failure(small, tmp_path, in_copy):
+    (run,) = small.experiment().runs(tmp_path)
+    run.path.mkdir(parents=True)
+    log_file(run).write_text(f"error: run_dir={run.path} is in use by another process; wait for it.\n")
+    assert end(run, 1)[0] == "elsewhere"
+    log_file(run).write_text("error: run_dir=... already holds a run\n")  # it began between our look and our start
+    with open(run.path / ".lock", "w") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)
+
+        def other() -> None:
+            assert end(run, 1)[0] == "elsewhere"
+
+        assert in_copy(other) == 0
+    assert end(run, 1)[0] == "failed"
+
+
+def test_a_verdict_holds_until_the_next_process_begins(small, tmp_path, monkeypatch):
+    (run,) = small.experiment().runs(tmp_path)
+    assert last_verdict(run) is None
+    note(run, "failed", "no such thing")
+    assert last_verdict(run) == ("failed", "no such thing")
+    note(run, "pruned", "below the median")
+    assert last_verdict(run) == ("pruned", "below the median")
+    monkeypatch.setattr(attempt, "command", lambda run: [sys.executable, "-S", "-c", ""])
+    start(run).wait()
+    assert last_verdict(run) is None
+
+
+def test_a_verdict_that_cannot_be_written_ends_nothing(small, tmp_path):
+    (run,) = small.experiment().runs(tmp_path)
+    run.path.parent.mkdir(parents=True)
+    run.path.write_text("a file where the directory should be")
+    note(run, "failed", "no space left")
+    assert last_verdict(run) is None
+    with pytest.raises(OSError):
+        start(run)
+
+
+def test_the_last_line_of_a_long_or_strange_log_is_found(small, tmp_path):
+    (run,) = small.experiment().runs(tmp_path)
+    run.path.mkdir(parents=True)
+    log_file(run).write_bytes(b"x" * 100_000 + b"\n\xff\xfe progress\r 50%\n" + b"error: at last\n\n  \n")
+    assert end(run, 1) == ("failed", "at last")

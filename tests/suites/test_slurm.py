@@ -1,0 +1,194 @@
+"""The script for SLURM: bash reads it, and its body does what it should under a stand-in for sbatch's environment."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from torchrl_etdmpc.suites import write_slurm_script
+from torchrl_etdmpc.suites.attempt import last_verdict, log_file
+
+pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+
+
+@pytest.fixture
+def submit(tmp_path, monkeypatch):
+    """Starts an index of the array as SLURM does: its variables are set, and `scontrol` is there."""
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    (tools / "scontrol").write_text(f'#!/bin/sh\necho "$@" >> {shlex.quote(str(tmp_path / "requeued"))}\n')
+    (tools / "scontrol").chmod(0o755)
+
+    def start(script, index: int) -> subprocess.Popen:
+        environment = {
+            **os.environ,
+            "PATH": f"{tools}:{os.environ['PATH']}",
+            "SLURM_ARRAY_JOB_ID": "70",
+            "SLURM_ARRAY_TASK_ID": str(index),
+            "SLURM_JOB_ID": str(71 + index),
+            "SLURM_CPUS_PER_TASK": "3",
+        }
+        return subprocess.Popen(["bash", str(script)], env=environment)
+
+    return start
+
+
+def requeued(tmp_path) -> list[str]:
+    file = tmp_path / "requeued"
+    return file.read_text().splitlines() if file.exists() else []
+
+
+def written(small, tmp_path, **options):
+    folder = tmp_path / "runs of 'mine'"
+    folder.mkdir(exist_ok=True)
+    runs = small.experiment(seeds=(1, 2, 3)).runs(folder)
+    return runs, write_slurm_script(runs, folder, "mine", **options)
+
+
+def begun(run) -> None:
+    deadline = time.monotonic() + 30
+    while not (run.path / "eval.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def test_bash_reads_it_and_the_options_are_there(small, tmp_path):
+    runs, script = written(small, tmp_path, sbatch="--partition=gpu --gres=gpu:1 --comment='two words'", workers=2)
+    checked = subprocess.run(["bash", "-n", str(script)], capture_output=True, text=True, check=False)
+    assert (checked.returncode, checked.stderr) == (0, "")
+    options = [shlex.split(line)[1] for line in script.read_text().splitlines() if line.startswith("#SBATCH")]
+    assert options == [
+        "--job-name=mine",
+        "--array=0-2%2",
+        "--requeue",
+        "--open-mode=append",
+        "--signal=B:USR1@120",
+        f"--output={script.parent}/slurm-%A_%a.out",
+        "--partition=gpu",
+        "--gres=gpu:1",
+        "--comment=two words",
+    ]
+    lines = [shlex.split(line) for line in (script.parent / "slurm.txt").read_text().splitlines()]
+    assert [line[0] for line in lines] == [str(log_file(run)) for run in runs]
+    assert all(line[1:5] == [sys.executable, "-m", "torchrl_etdmpc.commands", "train"] for line in lines)
+
+
+@pytest.mark.parametrize("sbatch", ["--time='1", "gpu", "--a=1 b", "'--a=1\nrm'"])
+def test_what_is_no_option_is_refused(small, tmp_path, sbatch):
+    with pytest.raises(ValueError, match="sbatch must hold options "):
+        written(small, tmp_path, sbatch=sbatch)
+
+
+def test_a_path_that_a_line_cannot_hold_is_refused(small, tmp_path):
+    runs = small.experiment().runs(tmp_path / "two\nlines")
+    with pytest.raises(ValueError, match="a path or a setting holds a line break, which slurm.txt cannot"):
+        write_slurm_script(runs, tmp_path, "mine")
+
+
+def test_an_index_trains_its_run_with_the_cores_that_it_has(small, tmp_path, stand_in, submit, monkeypatch):
+    from torchrl_etdmpc.suites import slurm
+
+    told = "import os, sys, pathlib; pathlib.Path(sys.argv[1]).write_text(os.environ['OMP_NUM_THREADS'] + sys.argv[2])"
+    monkeypatch.setattr(slurm, "command", lambda run: [sys.executable, "-S", "-c", told, str(run.path / "told")])
+    runs = small.experiment(settings=small.settings | {"threads": None}, seeds=(1, 2)).runs(tmp_path)
+    script = write_slurm_script(runs, tmp_path, "mine")
+    assert submit(script, 1).wait() == 0
+    assert (runs[1].path / "told").read_text() == "3threads=3"
+    assert not runs[0].path.exists()
+
+
+@pytest.fixture
+def stand_in_script(small, tmp_path, stand_in, monkeypatch):
+    from torchrl_etdmpc.suites import attempt, slurm
+
+    def write(plans, **options):
+        stand_in(plans)
+        monkeypatch.setattr(slurm, "command", attempt.command)
+        return written(small, tmp_path, **options)
+
+    return write
+
+
+def test_a_run_that_finishes_is_done(stand_in_script, submit, small, tmp_path):
+    runs, script = stand_in_script({})
+    process = submit(script, 2)
+    assert process.wait() == 0
+    assert [small.tries(run) for run in runs] == [0, 0, 1]
+    assert small.log_of(runs[2]) == ["suite: begun"]
+    assert requeued(tmp_path) == []
+
+
+def test_a_run_that_fails_is_tried_again_and_then_named(stand_in_script, submit, small, tmp_path):
+    runs, script = stand_in_script({"": [("fail", 0)]}, retries=2)
+    process = submit(script, 0)
+    assert process.wait() == 1
+    assert small.tries(runs[0]) == 3
+    assert last_verdict(runs[0]) == ("failed", "the simulator is gone")
+    assert requeued(tmp_path) == []
+
+
+def test_a_run_that_is_killed_is_tried_again(stand_in_script, submit, small):
+    runs, script = stand_in_script({"": [("kill", 100), ("fail", 100), ("finish", 400)]})
+    assert submit(script, 0).wait() == 0
+    assert small.tries(runs[0]) == 3
+
+
+def test_before_the_time_is_up_the_run_saves_itself_and_is_queued_again(stand_in_script, submit, small, tmp_path):
+    runs, script = stand_in_script({"": [("wait", 100), ("finish", 400)]})
+    # The stand-in knows SIGTERM; USR1 ends it at once, as it does a run that is still importing.
+    process = submit(script, 1)
+    begun(runs[1])
+    process.send_signal(signal.SIGUSR1)
+    assert process.wait(30) == 75
+    assert requeued(tmp_path) == ["requeue 72"]
+    assert last_verdict(runs[1]) is None
+    again = submit(script, 1)
+    assert again.wait() == 0
+    assert json.loads((runs[1].path / "summary.json").read_text())["env_steps"] == 400
+
+
+def test_a_run_that_leaves_by_itself_to_go_on_is_queued_again(stand_in_script, submit, tmp_path):
+    runs, script = stand_in_script({"": [("wait", 100)]})
+    process = submit(script, 0)
+    begun(runs[0])
+    pid = int(subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True).stdout)
+    os.kill(pid, signal.SIGTERM)
+    assert process.wait(30) == 75
+    assert requeued(tmp_path) == ["requeue 71"]
+
+
+def test_a_job_that_is_cancelled_saves_itself_and_stays_away(stand_in_script, submit, small, tmp_path):
+    runs, script = stand_in_script({"": [("wait", 100)]})
+    process = submit(script, 0)
+    begun(runs[0])
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 75
+    assert requeued(tmp_path) == []
+    assert small.tries(runs[0]) == 1
+
+
+@pytest.mark.slow
+def test_a_real_run_that_is_signalled_goes_on_to_the_end_of_one_left_alone(small, tmp_path, submit):
+    evaluated = []
+    for name, signalled in (("alone", False), ("signalled", True)):
+        (tmp_path / name).mkdir()
+        (run,) = small.experiment(budget=600).runs(tmp_path / name)
+        script = write_slurm_script([run], tmp_path / name, name)
+        process = submit(script, 0)
+        if signalled:
+            begun(run)
+            process.send_signal(signal.SIGUSR1)
+            assert process.wait(120) == 75
+            assert requeued(tmp_path) == ["requeue 71"]
+            process = submit(script, 0)
+        assert process.wait(300) == 0
+        rows = [line.split(",") for line in (run.path / "eval.csv").read_text().splitlines()]
+        evaluated.append([[*row[:3], *row[4:]] for row in rows])  # without the wall time
+    assert evaluated[0] == evaluated[1]

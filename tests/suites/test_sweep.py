@@ -1,0 +1,211 @@
+"""Searches: what is proposed, what it is worth, and that a kill loses nothing."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+
+import pytest
+
+from torchrl_etdmpc.suites import RunQueue, Search, Sweep, read_progress, run_locally
+from torchrl_etdmpc.suites.attempt import last_verdict
+
+pytest.importorskip("optuna")
+SPACE = {"optim.lr": {"low": 1e-4, "high": 1e-1, "log": True}, "model.mlp_dim": [16, 32]}
+
+
+@pytest.fixture
+def search(small):
+    """An experiment with one search."""
+
+    def make(trials: int = 6, prune: bool = True, space=SPACE, **changes):
+        searches = {"tuned": Search(space, trials, {"loss.rho": 0.4}, prune)}
+        return small.experiment(variants={}, searches=searches, **changes)
+
+    return make
+
+
+def worth(config) -> float:
+    """A peak at a learning rate of 1e-2 and 32 units."""
+    return 900 - 200 * abs(math.log10(config.optim.lr) + 2) + config.model.mlp_dim
+
+
+def train(small, sweep: Sweep, most: int = 1000) -> list[str]:
+    """Finishes the runs of the open trials and of all that are proposed, in no time; names of what was trained."""
+    done = []
+    while len(done) < most and (runs := sweep.runs() or sweep.propose()):
+        for run in runs:
+            small.write_finished(run, returns=worth(run.config) + run.seed)
+            done.append(run.name)
+        sweep.look()
+    return done
+
+
+def study_of(folder):
+    import optuna
+
+    return optuna.load_study(study_name="tuned", storage=f"sqlite:///{folder / 'sweeps.sqlite'}")
+
+
+def test_a_trial_is_a_variant_on_every_task_and_seed_with_proposed_settings(search, tmp_path):
+    kept = {}
+    sweep = Sweep(search(tasks=("cup-catch", "walker-walk"), seeds=(1, 2)), "tuned", tmp_path, kept.__setitem__)
+    runs = sweep.propose()
+    assert [run.name for run in runs] == [
+        f"tuned trial 0/{task}/seed{seed}" for task in ("cup-catch", "walker-walk") for seed in (1, 2)
+    ]
+    (config,) = {(run.config.optim.lr, run.config.model.mlp_dim, run.config.loss.rho) for run in runs}
+    assert 1e-4 <= config[0] <= 1e-1
+    assert config[1] in (16, 32)
+    assert config[2] == 0.4
+    assert kept == {"tuned trial 0": {"loss.rho": 0.4, "optim.lr": config[0], "model.mlp_dim": config[1]}}
+    assert runs[0].path == tmp_path / "tuned trial 0" / "cup-catch" / "seed1"
+
+
+def test_ranges_of_whole_numbers_propose_whole_numbers(search, tmp_path):
+    sweep = Sweep(search(space={"planner.horizon": {"low": 2, "high": 5}}), "tuned", tmp_path)
+    horizons = [sweep.propose()[0].config.planner.horizon for _ in range(6)]
+    assert {type(horizon) for horizon in horizons} == {int}
+    assert set(horizons) <= {2, 3, 4, 5}
+
+
+def test_the_value_of_a_trial_is_the_mean_over_tasks_and_seeds_of_the_last_return(search, small, tmp_path):
+    sweep = Sweep(search(trials=2, seeds=(1, 2, 6)), "tuned", tmp_path)
+    train(small, sweep)
+    assert sweep.done
+    assert sweep.propose() == []
+    for trial in study_of(tmp_path).trials:
+        (run, *_) = sweep._runs(trial.number, trial.params)
+        assert trial.value == pytest.approx(worth(run.config) + 3)
+    assert sweep.best().startswith("tuned: the best of 2 finished trials is trial ")
+
+
+@pytest.mark.slow
+def test_the_search_finds_the_peak(search, small, tmp_path):
+    sweep = Sweep(search(trials=40), "tuned", tmp_path)
+    train(small, sweep)
+    best = study_of(tmp_path).best_trial
+    assert best.params["model.mlp_dim"] == 32
+    assert 3e-3 < best.params["optim.lr"] < 3e-2
+
+
+def test_a_search_goes_on_with_what_was_running_and_repeats_nothing(search, small, tmp_path):
+    done = train(small, Sweep(search(trials=6), "tuned", tmp_path), most=3)
+    first = Sweep(search(trials=6), "tuned", tmp_path)
+    running = first.propose()
+    second = Sweep(search(trials=6), "tuned", tmp_path)
+    assert [run.name for run in second.runs()] == [run.name for run in running]
+    assert [run.config for run in second.runs()] == [run.config for run in running]
+    done += train(small, second)
+    assert len(done) == len(set(done)) == 6
+    points = [tuple(trial.params.values()) for trial in study_of(tmp_path).trials]
+    assert len(set(points)) == 6  # not the same first proposals again
+
+
+def test_a_process_that_is_killed_while_it_proposes_leaves_a_search_that_goes_on(search, small, tmp_path, in_copy):
+    Sweep(search(trials=3), "tuned", tmp_path).propose()
+
+    def die() -> None:
+        import optuna
+
+        sweep = Sweep(search(trials=3), "tuned", tmp_path)
+        suggest = optuna.trial.Trial._suggest
+
+        def after_one(trial, name, distribution):
+            if name == "model.mlp_dim":
+                os.kill(os.getpid(), signal.SIGKILL)
+            return suggest(trial, name, distribution)
+
+        optuna.trial.Trial._suggest = after_one
+        sweep.propose()
+
+    assert os.WIFSIGNALED(in_copy(die))
+    sweep = Sweep(search(trials=3), "tuned", tmp_path)
+    assert len(sweep.runs()) == 1
+    train(small, sweep)
+    values = [trial.value for trial in study_of(tmp_path).trials]
+    assert len([value for value in values if value is not None]) == 3
+
+
+def test_a_trial_below_the_median_of_five_ends_early(search, small, tmp_path):
+    sweep = Sweep(search(trials=8, seeds=(1, 2)), "tuned", tmp_path)
+    for _ in range(5):
+        runs = sweep.propose()
+        for run in runs:
+            small.write_tables(run, 100, returns=500.0)
+        assert sweep.look() == []
+        for run in runs:
+            small.write_finished(run, returns=500.0)
+        assert sweep.look() == []
+    good, bad = sweep.propose(), sweep.propose()
+    for run in (*good, bad[0]):
+        small.write_tables(run, 100, returns=600.0 if run in good else 100.0)
+    assert sweep.look() == []  # until all runs of the trial have been evaluated
+    small.write_tables(bad[1], 100, returns=120.0)
+    assert sweep.look() == bad
+    assert study_of(tmp_path).trials[6].intermediate_values == dict.fromkeys((25, 50, 75, 100), 110.0)
+    assert [run.name for run in sweep.runs()] == [run.name for run in good]
+
+
+def test_without_pruning_no_trial_ends_early(search, small, tmp_path):
+    sweep = Sweep(search(trials=7, prune=False), "tuned", tmp_path)
+    for returns in (500.0, 500.0, 500.0, 500.0, 500.0, 1.0):
+        (run,) = sweep.propose()
+        small.write_tables(run, 200, returns=returns)
+        assert sweep.look() == []
+        small.write_finished(run, returns=returns)
+        sweep.look()
+
+
+def test_what_was_pruned_is_marked_also_after_a_kill(search, small, tmp_path):
+    sweep = Sweep(search(trials=2), "tuned", tmp_path)
+    (run,) = sweep.propose()
+    small.write_tables(run, 100)
+    sweep._tell(0, None)
+    assert last_verdict(run) is None
+    again = Sweep(search(trials=2), "tuned", tmp_path)
+    assert read_progress(run).state == "pruned"
+    assert again.runs() == []
+    assert len(again.propose()) == 1
+    assert again.propose() == []
+
+
+def test_a_run_that_is_given_up_leaves_its_trial_to_the_next_process(search, small, tmp_path):
+    sweep = Sweep(search(trials=1, seeds=(1, 2)), "tuned", tmp_path)
+    first, second = sweep.propose()
+    small.write_finished(first)
+    sweep.give_up(second)
+    assert sweep.done
+    assert sweep.best() == "tuned: no trial is finished"
+    again = Sweep(search(trials=1, seeds=(1, 2)), "tuned", tmp_path)
+    assert [run.name for run in again.runs()] == [first.name, second.name]
+    small.write_finished(second)
+    again.look()
+    assert study_of(tmp_path).trials[0].value == 500.0
+
+
+def test_more_trials_may_be_asked_for(search, small, tmp_path):
+    train(small, Sweep(search(trials=2), "tuned", tmp_path))
+    assert len(train(small, Sweep(search(trials=5), "tuned", tmp_path))) == 3
+
+
+def test_a_damaged_study_is_refused_in_a_line(search, tmp_path):
+    (tmp_path / "sweeps.sqlite").write_bytes(b"not a database at all" * 100)
+    with pytest.raises(
+        ValueError, match="sweeps.sqlite cannot be used as a study .*; remove it to search anew."
+    ) as error:
+        Sweep(search(), "tuned", tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_pool_trains_a_search_to_its_end(search, small, tmp_path, stand_in, monkeypatch):
+    from torchrl_etdmpc.suites import local, run_queue
+
+    monkeypatch.setattr(local, "_POLL_S", 0.01)
+    monkeypatch.setattr(run_queue, "_LOOK_AGAIN_S", 0.02)
+    stand_in({"trial 2": [("fail", 0)], "trial 1": [("kill", 10), ("finish", 400)]})
+    sweep = Sweep(search(trials=4, seeds=(1, 2)), "tuned", tmp_path)
+    assert run_locally(RunQueue(sweep.runs(), trials=[sweep]), workers=3)
+    values = [trial.value for trial in study_of(tmp_path).trials]
+    assert [value is None for value in values] == [False, False, True, False]
