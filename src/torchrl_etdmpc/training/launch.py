@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -108,6 +109,7 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         return f"{plan.directory} is finished; nothing to do"
     require_logger(plan.config.logger)
     resolve_device(plan.config.device)
+    others = set(multiprocessing.active_children())
     with StopSignals() as stop:
         try:
             summary = _train(plan, stop)
@@ -116,6 +118,8 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
             # of it.
             if not (stop.requested and stop.nothing_to_save):
                 raise
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()  # one that is just starting would complain that its owner has gone
             state = "with nothing to save" if plan.action == "begin" else f"{plan.directory} goes on from where it was"
             raise RunInterrupted(f"stopped before the first step, {state}; start it again.") from None
     return (
