@@ -165,7 +165,8 @@ class Updater:
     def _average(self) -> None:
         model, averaged = self.loss.world_model, self.acting_model
         if averaged is not model:
-            torch._foreach_lerp_(list(averaged.parameters()), list(model.parameters()), 1 - self.average_decay)
+            both = list(averaged.parameters()), list(model.parameters())
+            torch._foreach_lerp_(*both, 1 - self.average_decay)  # pyright: ignore[reportPrivateImportUsage]
             for mine, newest in zip(averaged.buffers(), model.buffers(), strict=True):
                 mine.copy_(newest)  # the version, by which plans are dated
 
@@ -232,10 +233,11 @@ class Updater:
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser, averaged weights, and the counts of skipped updates (the weights are the loss's)."""
-        state = {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
+        state: dict[str, Any] = {"optimizer": self.optimizer.state_dict()}
+        state |= {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
         if self.average_decay:
             state["averaged"] = self.acting_model.state_dict()
-        return {"optimizer": self.optimizer.state_dict()} | state
+        return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`."""
