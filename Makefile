@@ -3,7 +3,7 @@
 PYTHON ?= python3
 TASK ?= walker-stand
 RUN_DIR ?= runs/$(TASK)
-JOBS ?= 2
+JOBS ?= 3
 ARGS ?=
 
 VENV := .venv
@@ -18,7 +18,7 @@ help:
 	@echo "make train   train on a CPU in minutes (TASK=walker-stand, RUN_DIR=runs/TASK, ARGS=\"more settings\")"
 	@echo "make watch   film the agent of RUN_DIR into RUN_DIR/film.mp4"
 	@echo "make report  curves and tables of RUN_DIR beside published baselines"
-	@echo "make test    run the tests and the examples in docstrings, JOBS=2 files at a time (ARGS=\"pytest options\")"
+	@echo "make test    run the tests and the examples in docstrings, JOBS=3 files at a time (ARGS=\"pytest options\")"
 	@echo "make lint    check style, format and types, as the commit hooks and CI do"
 	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
 	@echo "make clean   remove .venv, caches and build output; runs/ stays"

@@ -46,7 +46,6 @@ def through_a_file(state):
     [
         ("walker-walk", 1, False),
         ("walker-walk", 3, False),
-        ("walker-walk", 2, True),
         ("quadruped-walk", 1, False),  # random initial orientation, rescaled actions
         ("reacher-easy", 1, False),  # a target drawn at every reset
         ("humanoid-run", 1, False),
@@ -60,6 +59,11 @@ def test_another_environment_goes_on_where_the_first_one_was(task, num_envs, par
     resume(task, num_envs, parallel, steps)
 
 
+def test_worker_processes_go_on_where_the_first_ones_were():
+    resume("walker-walk", 2, True, 2 * LIMIT + 3)
+
+
+@pytest.mark.slow  # worker processes start four times
 @needs_gym
 def test_worker_processes_of_gymnasium_go_on_where_the_first_ones_were():
     resume("gym/Pendulum-v1", 2, parallel=True, steps=2 * LIMIT + 3)

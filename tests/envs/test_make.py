@@ -165,7 +165,7 @@ def test_several_environments_have_the_entries_of_one_and_seeds_of_their_own(nam
     assert torch.equal(start[0], single.reset()["observation"])
 
 
-@pytest.mark.parametrize("name", ["gym/Pendulum-v1", "own-pendulum"])
+@pytest.mark.parametrize("name", [pytest.param("gym/Pendulum-v1", marks=pytest.mark.slow), "own-pendulum"])
 def test_worker_processes_play_what_this_process_would(name):
     threads = torch.get_num_threads()
     rows = []

@@ -95,7 +95,7 @@ def test_a_task_that_was_imported_is_known_by_its_path(folder):
     ("path", "parallel"),
     [
         ("my_file:make_my_env", False),
-        ("my_file:make_my_env", True),
+        pytest.param("my_file:make_my_env", True, marks=pytest.mark.slow),
         ("more_tasks:REGISTERED", False),
         ("more_tasks:OF_A_SUITE", False),
         ("more_tasks:OF_A_SUITE", True),  # the workers have not registered its id

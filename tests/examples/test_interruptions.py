@@ -154,7 +154,11 @@ def test_a_run_that_is_killed_twenty_times_ends_as_if_it_had_not_been(tmp_path, 
     assert results(tmp_path / "killed" / "run") == results(tmp_path / "straight" / "run")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGUSR1))],
+    ids=lambda number: number.name,
+)
 def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, train, straight, number):
     process = train(tmp_path, "run_dir=run")
     wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)

@@ -86,7 +86,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(values=CONFIGURATIONS, seed=st.integers(0, 2**31))
 def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values: dict[str, Any], seed: int):
     steps = 2 * values["replay"]["seed_decisions"] + 12

@@ -135,10 +135,10 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, st
         {"num_envs": 3, "total_env_steps": 200},
         {"replay": {"insertion": "episode"}, "episode_length": 40},
         {"replay": {"capacity": 30}},
-        {"reanalyze": {"every": 0}},
+        pytest.param({"reanalyze": {"every": 0}}, marks=pytest.mark.slow),
         {"overlap": True},
         {"optim": {"average_decay": 0.9}},
-        {"planner": {"first_action": "mean"}, "eval_policy": True},
+        pytest.param({"planner": {"first_action": "mean"}, "eval_policy": True}, marks=pytest.mark.slow),
     ],
 )
 def test_every_kind_of_run_can_be_stopped_many_times(tmp_path, straight, changes, small_config, make_run):

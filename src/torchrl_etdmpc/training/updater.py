@@ -165,10 +165,10 @@ class Updater:
     def _average(self) -> None:
         model, averaged = self.loss.world_model, self.acting_model
         if averaged is not model:
-            both = list(averaged.parameters()), list(model.parameters())
-            torch._foreach_lerp_(*both, 1 - self.average_decay)  # pyright: ignore[reportPrivateImportUsage]
-            for mine, newest in zip(averaged.buffers(), model.buffers(), strict=True):
-                mine.copy_(newest)  # the version, by which plans are dated
+            followers, leaders = ([*network.parameters()] for network in (averaged, model))
+            torch._foreach_lerp_(followers, leaders, 1 - self.average_decay)  # pyright: ignore
+            for buffer, newest in zip(averaged.buffers(), model.buffers(), strict=True):
+                buffer.copy_(newest)  # the version, by which plans are dated
 
     def warm_up(self, batch: TensorDictBase) -> None:
         """Compiles on a batch of the shapes to come; weights, running scale and optimiser stay as they are.
