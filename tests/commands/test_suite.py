@@ -257,6 +257,13 @@ def test_a_setting_of_a_variant_that_does_not_exist_is_found_before_anything_sta
     assert not (tmp_path / "here").exists()
 
 
+def test_a_setting_that_only_a_part_refuses_is_found_before_anything_starts(call, mine, trained, tmp_path):
+    code, _ = call(f"experiment={mine(variants={'a': {}, 'b': {'planner.horizon': 0}})}", "runs_dir=here")
+    assert code == "error: variant 'b': planner.horizon must be at least 1, got 0."
+    assert trained == []
+    assert not (tmp_path / "here").exists()
+
+
 def test_an_experiment_that_was_changed_is_never_mixed_with_what_it_was(call, mine, trained, tmp_path):
     call(f"experiment={mine()}", "runs_dir=here")
     before = (tmp_path / "here" / "experiment.yaml").read_bytes()

@@ -31,7 +31,14 @@ from torchrl_etdmpc.suites import (
     write_slurm_script,
 )
 from torchrl_etdmpc.suites.attempt import command
-from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, TrainConfig, config_from_dict, follow_own_code
+from torchrl_etdmpc.training import (
+    EXIT_CODE,
+    TASK_SETTINGS,
+    TrainConfig,
+    build_agent,
+    config_from_dict,
+    follow_own_code,
+)
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiments"
 WHAT = """Trains every run of an experiment: tasks x seeds x variants.
@@ -114,6 +121,7 @@ def main() -> None:
         return
     whole = asked if stored is None else extended(stored, asked, folder)
     runs = asked.runs(folder)
+    _require_parts(runs)
     if config.dry_run:
         print(_plan(asked, runs))
         return
@@ -128,6 +136,15 @@ def main() -> None:
         _write_for_slurm(config, asked, runs, folder)
         return
     sys.exit(_carry_out(config, asked, runs, folder))
+
+
+def _require_parts(runs: Iterable[Run]) -> None:
+    """Makes the networks and planners of each variant once: some settings are checked by the parts alone."""
+    for run in {run.variant: run for run in runs}.values():
+        try:
+            build_agent(dataclasses.replace(run.config, compile="off"), 3, 1)
+        except ValueError as error:
+            raise ValueError(f"variant {run.variant!r}: {error}") from error
 
 
 def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: Path) -> int:
