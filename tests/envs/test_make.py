@@ -5,6 +5,9 @@ import importlib.util
 import io
 import multiprocessing
 import os
+import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -15,7 +18,7 @@ pytest.importorskip("dm_control")
 pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import Task, check_env, get_task, make_env, register_task  # noqa: E402
-from torchrl_etdmpc.envs.make import _SilentWithoutOwner  # noqa: E402
+from torchrl_etdmpc.envs.worker import SilentWithoutOwner, signals_held_back  # noqa: E402
 
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("imageio") is None, reason="needs gymnasium[mujoco]")
 
@@ -244,9 +247,28 @@ def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
     monkeypatch.setattr(os, "_exit", leave)
     sentinel, owner = multiprocessing.Pipe(duplex=False)
     text = io.StringIO()
-    stderr = _SilentWithoutOwner(text, sentinel.fileno())
+    stderr = SilentWithoutOwner(text, sentinel.fileno())
     stderr.write("a warning")
     owner.close()  # as the system does when the owner's process ends
     with pytest.raises(LeftError):
         print("Traceback", file=stderr)
     assert text.getvalue() == "a warning"
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs POSIX signals")
+def test_a_process_that_is_just_starting_answers_a_signal_when_it_is_ready():
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    program = (
+        "import signal, sys, torchrl_etdmpc.envs.worker as worker\n"
+        "sys.stdin.readline()\n"
+        "print('importing')\n"
+        "worker.take_signals(lambda number, _: print(signal.Signals(number).name))\n"
+    )
+    with signals_held_back():
+        process = subprocess.Popen(
+            [sys.executable, "-c", program], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate("\n", timeout=60)
+    assert (process.returncode, out.split()) == (0, ["importing", "SIGINT"])

@@ -9,6 +9,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -182,6 +183,27 @@ def test_a_signal_that_reaches_the_environments_too_is_left_to_the_run(tmp_path,
     assert "env steps and saved in run; go on with resume=true." in finish(process, EXIT_CODE)
     finish(train(tmp_path, "run_dir=run", "resume=true"))
     assert results(tmp_path / "run") == results(tmp_path / "straight" / "run")
+
+
+@pytest.mark.slow  # four worker processes, and imports from the beginning
+def test_a_signal_that_reaches_environments_that_are_just_starting(tmp_path):
+    # A process of a shell's: those of `train` are forked, and so would be its workers.
+    script = Path(__file__).parents[2] / "examples" / "train_dmc.py"
+    process = subprocess.Popen(
+        [sys.executable, str(script), "task=cartpole-balance", "num_envs=4", *COMMAND, "run_dir=run"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # also in the background
+    )
+    workers = ["pgrep", "-g", str(process.pid), "-f", "spawn_main"]
+    wait_for(lambda: subprocess.run(workers, stdout=subprocess.DEVNULL, check=False).returncode == 0, process)
+    os.killpg(process.pid, signal.SIGINT)
+    text = finish(process, EXIT_CODE)
+    assert "stopped before the first step" in text
+    assert "Traceback" not in text
 
 
 def test_a_second_signal_ends_the_process_at_once_and_the_last_checkpoint_stays(tmp_path, train, straight):

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import multiprocessing.connection
 import os
-import signal
-import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TextIO
 
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv
@@ -18,11 +13,10 @@ from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.dmc import dmc_maker
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
+from torchrl_etdmpc.envs.worker import make_in_worker, signals_held_back
 
 __all__ = ["find_maker", "make_env"]
 
-# How long a worker process outlives a signal to stop, in seconds.
-_GRACE_S = 10
 # Each says which function makes one environment of a task, or why it cannot be made on this machine.
 _SUITES: dict[str, Callable[[Task], Maker]] = {"dm_control": dmc_maker, "gymnasium": gymnasium_maker}
 
@@ -80,8 +74,10 @@ def make_env(
         env = SerialEnv(num_envs, partial(make, device="cpu"), device=device, num_threads=torch.get_num_threads())
     else:
         # Left alone, ParallelEnv would change this process' own number of threads.
-        in_worker = partial(_make_in_worker, make, os.getpid())
+        in_worker = partial(make_in_worker, make, os.getpid())
         env = ParallelEnv(num_envs, in_worker, device=device, num_threads=torch.get_num_threads())
+        with signals_held_back():
+            env.start()
     if seed is not None:
         env.set_seed(seed)
     return env
@@ -122,32 +118,3 @@ def _make_one(make: Maker, task: Task, *, device: torch.device | str) -> EnvBase
     except ValueError as error:
         raise ValueError(f"task {task.name!r}: {error}") from None
     return env
-
-
-def _make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
-    """In a worker process, leaves the ``owner`` time to finish its step and save after a signal to stop.
-
-    Ctrl-C and job schedulers signal all processes of a job at once. TorchRL calls this once in the owner's process too.
-    """
-    process = multiprocessing.parent_process()
-    if process is not None and os.getpid() != owner:
-        sys.stderr = _SilentWithoutOwner(sys.stderr, process.sentinel)
-    if os.getpid() != owner and hasattr(signal, "SIGALRM"):
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
-            signal.signal(number, lambda *_: signal.alarm(_GRACE_S))
-    return make(device="cpu")
-
-
-class _SilentWithoutOwner:
-    """The stderr of a worker. One whose owner was killed finds its pipe broken; it ends without a traceback."""
-
-    def __init__(self, stream: TextIO, owner: int) -> None:
-        self._stream, self._owner = stream, owner
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        if multiprocessing.connection.wait([self._owner], 0.05):  # it may just be going
-            os._exit(1)
-        return self._stream.write(text)

@@ -22,6 +22,7 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_etdmpc.collectors import SeedPolicy
 from torchrl_etdmpc.envs import import_task, make_env
+from torchrl_etdmpc.envs.worker import signals_held_back, take_signals
 from torchrl_etdmpc.keys import WORKER
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.runs import first_line
@@ -115,9 +116,7 @@ class WorkerParts:
 def leave_signals_to_the_owner() -> None:
     """In a worker: Ctrl-C signals all processes of a job, but it ends when its owner says so or is gone."""
     torchrl_logger.setLevel("WARNING")
-    for name in ("SIGINT", "SIGTERM", "SIGUSR1"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    take_signals(signal.SIG_IGN)
 
 
 def start_workers(parts: WorkerParts, *, engine: Engine, numbers: range, rows: int) -> BaseCollector:
@@ -137,16 +136,17 @@ def start_workers(parts: WorkerParts, *, engine: Engine, numbers: range, rows: i
     makers: Any = [partial(parts.make_env, number) for number in numbers]
     options: dict[str, Any] = {"policy_factory": parts.make_actor, "frames_per_batch": rows}
     if engine == "multi":
-        return MultiAsyncCollector(
-            makers,
-            **options,
-            total_frames=-1,
-            use_buffers=False,
-            weight_sync_schemes={"policy": SharedMemWeightSyncScheme()},
-            auto_register_policy_transforms=True,
-            num_threads=torch.get_num_threads(),
-            init_fn=leave_signals_to_the_owner,
-        )
+        with signals_held_back():
+            return MultiAsyncCollector(
+                makers,
+                **options,
+                total_frames=-1,
+                use_buffers=False,
+                weight_sync_schemes={"policy": SharedMemWeightSyncScheme()},
+                auto_register_policy_transforms=True,
+                num_threads=torch.get_num_threads(),
+                init_fn=leave_signals_to_the_owner,
+            )
     from torchrl.collectors.distributed import RayCollector
 
     in_worker = {"auto_register_policy_transforms": True, "use_buffers": False}

@@ -1,0 +1,71 @@
+"""Processes that step environments: what they do about signals, and when their owner is gone."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any, TextIO
+
+from torchrl.envs import EnvBase
+
+# How long a worker process outlives a signal to stop, in seconds.
+_GRACE_S = 10
+_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)}
+
+
+@contextlib.contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Holds signals to stop back from processes that are started here, until they call :func:`take_signals`.
+
+    Ctrl-C signals all processes of a job, and one that is still importing would answer with a traceback.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # processes inherit it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def take_signals(handler: Any) -> None:
+    """In a worker: answers signals to stop from now on, also the one that has been held back."""
+    for number in _SIGNALS:
+        signal.signal(number, handler)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+
+
+def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
+    """In a worker process, leaves the ``owner`` time to finish its step and save after a signal to stop.
+
+    Job schedulers signal all processes of a job at once, as Ctrl-C does. TorchRL calls this once in the owner's process
+    too.
+    """
+    process = multiprocessing.parent_process()
+    if process is not None and os.getpid() != owner:
+        sys.stderr = SilentWithoutOwner(sys.stderr, process.sentinel)
+    if os.getpid() != owner and hasattr(signal, "SIGALRM"):
+        take_signals(lambda *_: signal.alarm(_GRACE_S))
+    return make(device="cpu")
+
+
+class SilentWithoutOwner:
+    """The stderr of a worker. One whose owner was killed finds its pipe broken; it ends without a traceback."""
+
+    def __init__(self, stream: TextIO, owner: int) -> None:
+        self._stream, self._owner = stream, owner
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        if multiprocessing.connection.wait([self._owner], 0.05):  # it may just be going
+            os._exit(1)
+        return self._stream.write(text)
