@@ -15,7 +15,11 @@ from torchrl_etdmpc.training import Agent, build_agent, build_planner, build_wor
 from torchrl_etdmpc.training.config import PlannerConfig
 
 OBSERVATION_DIM, ACTION_DIM = 5, 2
-COMPILE_OPTIONS = {"options": {"fallback_random": True, "cpp_wrapper": True}, "dynamic": False, "fullgraph": True}
+COMPILE_OPTIONS = {
+    "options": dict.fromkeys(("fallback_random", "cpp_wrapper", "cpp_wrapper_build_separate"), True),
+    "dynamic": False,
+    "fullgraph": True,
+}
 PLANNERS = ("planner", "eval_planner", "reanalyze_planner")
 
 
@@ -161,7 +165,7 @@ def test_more_than_20_action_dimensions_add_iterations_to_acting_and_to_reanalyz
 def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compiled, tiny_agent):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.warns(UserWarning) as caught:
-        tiny_agent(compile="auto")
+        tiny_agent(compile="auto", total_env_steps=40_000)
     assert [str(warning.message) for warning in caught] == [
         "no C++ compiler found, so nothing is compiled and training is slower; install g++."
     ]

@@ -77,9 +77,11 @@ def test_a_sample_is_a_batch_of_slices(tiny_config):
     assert replay.writer.tracks_generations
 
 
-def test_slices_may_begin_in_the_last_steps_of_an_episode_if_asked(tiny_config):
+def test_slices_may_begin_in_the_last_steps_of_an_episode_where_episodes_can_end_early_or_if_asked(tiny_config):
     assert not build_replay(tiny_config()).sampler.partial
+    assert build_replay(tiny_config(terminates=True)).sampler.partial
     assert build_replay(tiny_config(replay={"partial": True})).sampler.partial
+    assert not build_replay(tiny_config(terminates=True, replay={"partial": False})).sampler.partial
 
 
 @pytest.mark.parametrize(("updates", "every", "interval"), [(1, 10, 10), (2, 5, 10), (4, 2, 8)])

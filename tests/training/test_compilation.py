@@ -13,7 +13,10 @@ import torch
 pytest.importorskip("dm_control")
 
 from torchrl_etdmpc.testing import random_slices  # noqa: E402
-from torchrl_etdmpc.training import build_agent  # noqa: E402
+from torchrl_etdmpc.training import (
+    build_agent,  # noqa: E402
+    compilation,  # noqa: E402
+)
 from torchrl_etdmpc.training.compilation import compile_call, resolve_compile  # noqa: E402
 
 needs_compiler = pytest.mark.skipif(
@@ -38,7 +41,15 @@ def test_auto_compiles_where_a_compiler_exists(monkeypatch, setting, device, com
     monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}" if name == compiler else None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert resolve_compile(setting, torch.device(device)) == mode
+        assert resolve_compile(setting, torch.device(device), 10_000) == mode
+
+
+def test_auto_does_not_compile_what_is_over_sooner_without(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    assert resolve_compile("auto", cpu, 9_999) is None
+    assert resolve_compile("auto", cuda, 1) == "reduce-overhead"
+    assert resolve_compile("default", cpu, 1) == "default"
 
 
 def test_the_results_of_a_graph_that_is_replayed_outlive_the_next_call(monkeypatch):
@@ -80,6 +91,7 @@ def test_a_run_that_cannot_compile_goes_on_without_and_says_so_once(tmp_path, mo
 
     monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/g++")
     monkeypatch.setattr(torch, "compile", broken)
+    monkeypatch.setattr(compilation, "_WORTH_IT", 0)
     run = make_run(tiny_config(compile="auto", total_env_steps=80, checkpoint_every=1000), tmp_path)
     with pytest.warns(
         UserWarning, match=r"^cannot compile here, so training is slower: no such file: omp.h$"

@@ -118,7 +118,7 @@ UTD4 = {
     "replay.capacity": 1_000_000,
     "replay.insertion": "step",
     "replay.uniform_over": "episodes",
-    "replay.partial": False,
+    "replay.partial": None,  # if the task terminates
     "replay.device": "auto",
     "replay.seed_decisions": None,  # max(1000, 5 episodes)
     "replay.pretrain_updates": None,  # as many as seed decisions
@@ -604,6 +604,7 @@ OWN_DEFAULT = {
         *("proposal_log_std_min", "proposal_log_std_max"),
     },
     LossConfig: {"discount", "slice_len", "extra_terms"},  # the classes have none; a path to the terms
+    ReplayConfig: {"partial"},  # follows from the task
 }
 
 

@@ -156,7 +156,7 @@ def build_agent(
         ValueError: if a setting is out of range; the text begins with its name.
     """
     device, task = torch.device(device), config.task_spec
-    compile_mode = resolve_compile(config.compile, device)
+    compile_mode = resolve_compile(config.compile, device, config.total_decisions - config.seed_decisions)
     discount = config.loss.discount
     if discount is None:
         discount = discount_from_episode_length(task.decision_steps_per_episode)

@@ -74,12 +74,17 @@ def build_replay(
         sizes (tuple of int): O and A, for the rule of ``replay.device=auto``. Default: rows of no size, which fit.
     """
     rows = min(config.replay.capacity, config.total_decisions + config.num_envs)
+    partial = config.replay.partial
+    if partial is None:
+        # Departure from BMPC, whose slices lie within an episode: its last steps then never begin a slice, and what is
+        # learned of them has the least weight.
+        partial = config.task_spec.terminates
     with named_settings("loss", config.loss):
         sampler = StepSliceSampler(
             config.loss.slice_len,
             traj_key=[WORKER, TRAJECTORY] if isinstance(config, DistributedConfig) else TRAJECTORY,
             uniform_over=config.replay.uniform_over,
-            partial=config.replay.partial,
+            partial=partial,
             as_slices=True,
         )
     return TensorDictReplayBuffer(
