@@ -1,0 +1,209 @@
+"""What else a user could pick on one CPU core: SAC and TQC of Stable-Baselines3 beside the cpu preset, by the clock.
+
+    pip install --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
+    python benchmarks/race.py                                # all runs that are missing, one after the other (a day)
+    python benchmarks/race.py --tasks walker-walk --algorithms tqc --settings zoo --seeds 1
+    python benchmarks/race.py --report-only RUN_DIRECTORY... # figure and table, beside runs of ours
+
+The same physics, action repeat, evaluation (mean of 10 episodes without noise on starts that the run's seed gives) and
+one thread. Two settings each, because a library is worth what its better one reaches: `default` is
+Stable-Baselines3's own, `zoo` is what RL Baselines3 Zoo tuned for PyBullet's locomotion tasks (state-dependent
+exploration; hyperparameters of HalfCheetahBulletEnv). Minutes count everything but imports: evaluations too, and for
+ours compilation. Writes `benchmarks/results/cpu/race/<method>/<task>/seed<k>/` and, there,
+`race.png` and `README.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import numpy as np
+import torch
+from cpu_learning import RESULTS
+from dm_control import suite
+from matplotlib.figure import Figure
+from tensordict.nn import TensorDictModule
+
+from torchrl_etdmpc.analysis import estimate, method_styles, read_runs
+from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.envs import get_task, make_env
+from torchrl_etdmpc.envs.dmc import domain_and_task
+from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions
+
+FOLDER = RESULTS / "race"
+TASKS = ("walker-walk", "cheetah-run", "reacher-easy", "cartpole-swingup")
+ALGORITHMS = ("sac", "tqc")
+SETTINGS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "zoo": {
+        "learning_rate": 7.3e-4,
+        "buffer_size": 300_000,
+        "batch_size": 256,
+        "ent_coef": "auto",
+        "gamma": 0.98,
+        "tau": 0.02,
+        "train_freq": 8,
+        "gradient_steps": 8,
+        "learning_starts": 10_000,
+        "use_sde": True,
+        "policy_kwargs": {"log_std_init": -3, "net_arch": [400, 300]},
+    },
+}
+ENV_STEPS, EVAL_EVERY, EPISODES = 200_000, 10_000, 10
+
+
+class DMCGym(gymnasium.Env):
+    """A DMC task as Stable-Baselines3 takes it, without the layers of TorchRL."""
+
+    def __init__(self, task: str, seed: int) -> None:
+        spec = get_task(task)
+        self.env = suite.load(
+            *domain_and_task(task), task_kwargs={"random": seed}, environment_kwargs={"flat_observation": True}
+        )
+        self.env._step_limit = spec.episode_length  # dm_control has no other name for it in steps
+        self.repeat = spec.action_repeat
+        action = self.env.action_spec()
+        size = self.env.observation_spec()["observations"].shape
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
+        self.action_space = gymnasium.spaces.Box(-1, 1, action.shape, np.float32)
+        self._middle, self._half = (action.maximum + action.minimum) / 2, (action.maximum - action.minimum) / 2
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return self._observation(self.env.reset()), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        reward = 0.0
+        for _ in range(self.repeat):
+            step = self.env.step(self._middle + self._half * action.astype(np.float64))
+            reward += step.reward
+            if step.last():
+                break
+        return self._observation(step), reward, False, step.last(), {}  # DMC ends at its time limit alone
+
+    def _observation(self, step: Any) -> np.ndarray:
+        return step.observation["observations"].astype(np.float32)
+
+
+def train(task: str, algorithm: str, settings: str, seed: int, target: Path, env_steps: int) -> str:
+    """One run into ``target``, evaluated as ours are."""
+    from stable_baselines3 import SAC
+
+    made_of: Any = SAC
+    if algorithm == "tqc":
+        from sb3_contrib import TQC as made_of  # noqa: N811
+
+    torch.set_num_threads(1)
+    repeat = get_task(task).action_repeat
+    model = made_of("MlpPolicy", DMCGym(task, seed), seed=seed, device="cpu", **SETTINGS[settings])
+    starts = make_env(task, num_envs=EPISODES, parallel=False)
+
+    def act(observation: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
+
+    policy = TensorDictModule(act, in_keys=["observation"], out_keys=["action"])
+    directory = RunDirectory(target)
+    method = f"{algorithm.upper()} ({settings})"
+    directory.begin({"task": task, "preset": method, "seed": seed})
+    log = RunLog(directory, total_env_steps=env_steps)
+    began = time.perf_counter()
+
+    def note() -> float:
+        with torch.random.fork_rng([]):
+            torch.manual_seed(seed)
+            starts.set_seed(seed)
+            returns = evaluate(starts, policy, episodes=EPISODES)
+        steps = model.num_timesteps
+        counters = {"env_steps": steps * repeat, "decision_steps": steps, "updates": model._n_updates}
+        row = {"return_mean": returns.mean().item(), "return_std": returns.std(correction=0).item()}
+        log.log_eval({**row, "episodes": EPISODES}, **counters, wall_time_s=time.perf_counter() - began)
+        return row["return_mean"]
+
+    final = note()
+    for _ in range(EVAL_EVERY, env_steps + 1, EVAL_EVERY):
+        model.learn(EVAL_EVERY // repeat, reset_num_timesteps=False)
+        final = note()
+    versions = library_versions()
+    versions |= {name: importlib.metadata.version(name) for name in ("stable-baselines3", "sb3-contrib")}
+    summary = {"task": task, "preset": method, "seed": seed, "env_steps": env_steps, "final_return": final}
+    log.finish({**summary, "wall_time_s": round(time.perf_counter() - began, 1), "threads": 1, "versions": versions})
+    directory.close()
+    starts.close()
+    return f"{task}, {method}, seed {seed}: return {final:.0f} in {(time.perf_counter() - began) / 60:.0f} min"
+
+
+def report(ours: list[Path]) -> str:
+    """Figure and table of every method over env steps and over minutes."""
+    curves = read_runs([FOLDER, *ours])
+    curves = curves[curves["task"].isin(TASKS)]
+    methods = [*sorted(set(curves["method"]) - {"cpu"}), "cpu"]
+    styles = method_styles(methods)
+    minutes = curves.groupby(["task", "method", "env_steps"])["wall_time_s"].mean() / 60
+    found = estimate(curves).join(minutes.rename("minutes"), on=["task", "method", "env_steps"])
+    tasks = [task for task in TASKS if task in set(found["task"])]
+    figure = Figure(figsize=(3.1 * len(tasks), 5.2), layout="constrained")
+    axes = figure.subplots(2, len(tasks), squeeze=False, sharey=True)
+    for column, task in enumerate(tasks):
+        for row, x in enumerate(("env_steps", "minutes")):
+            axis = axes[row, column]
+            for method in methods:
+                line = found[(found["task"] == task) & (found["method"] == method) & (found["env_steps"] > 0)]
+                axis.plot(line[x], line["mean"], label=method, linewidth=1.6, **styles[method])
+                if line["se"].notna().all():
+                    spread = 1.96 * line["se"]
+                    axis.fill_between(
+                        line[x], line["mean"] - spread, line["mean"] + spread, color=styles[method]["color"], alpha=0.15
+                    )
+            axis.set(title=task if row == 0 else None, xlabel=("env steps", "minutes on one core")[row])
+            axis.grid(alpha=0.3)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("episode return")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    figure.savefig(FOLDER / "race.png", dpi=150)
+    lines = ["# By the clock", "", *__doc__.split("\n\n")[-1].splitlines(), ""]
+    lines += ["| task | method | seeds | return at 50,000 env steps | minutes until then | last return | minutes |"]
+    lines += ["|---" * 7 + "|"]
+    for (task, method), rows in found.groupby(["task", "method"]):
+        early, last = rows[rows["env_steps"] <= 50_000].iloc[-1], rows.iloc[-1]
+        cells = [f"{early['mean']:.0f}", f"{early['minutes']:.1f}", f"{last['mean']:.0f}", f"{last['minutes']:.1f}"]
+        seeds = curves[(curves["task"] == task) & (curves["method"] == method)]["seed"].nunique()
+        lines.append(f"| {task} | {method} | {seeds} | " + " | ".join(cells) + " |")
+    versions = {json.dumps(json.loads(path.read_text())["versions"]) for path in FOLDER.rglob("summary.json")}
+    lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
+    return "\n".join([*lines, "", "![race](race.png)", ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS))
+    parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
+    parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
+    parser.add_argument("--out", type=Path, default=FOLDER)
+    parser.add_argument("--report-only", nargs="*", type=Path, metavar="RUNS")
+    arguments = parser.parse_args()
+    if arguments.report_only is None:
+        for seed in arguments.seeds:
+            for task in arguments.tasks:
+                for algorithm in arguments.algorithms:
+                    for settings in arguments.settings:
+                        target = arguments.out / f"{algorithm}-{settings}" / task / f"seed{seed}"
+                        if not RunDirectory(target).finished:
+                            print(train(task, algorithm, settings, seed, target, arguments.env_steps), flush=True)
+    else:
+        (FOLDER / "README.md").write_text(report(arguments.report_only))
+
+
+if __name__ == "__main__":
+    main()
