@@ -8,11 +8,16 @@ ARGS ?=
 
 VENV := .venv
 READY := $(VENV)/.ready
+# HumanoidBench simulates what it was published with only on an older MuJoCo, so it has an environment of its own.
+HUMANOID_BENCH ?=
+HUMANOID_REPOSITORY := https://github.com/carlosferrazza/humanoid-bench
+HUMANOID_COMMIT := 791405f5eacf879adbc99105adb3fee73f5a49fc
+HUMANOID_VENV := .venv-humanoidbench
 # What was typed, for what to type next.
 SAME_RUN = $(if $(filter command line,$(origin RUN_DIR)), RUN_DIR="$(RUN_DIR)",$(if $(filter command line,$(origin TASK)), TASK=$(TASK)))
 
 .DEFAULT_GOAL := help
-.PHONY: help train watch report test lint bench clean
+.PHONY: help train watch report test lint bench humanoidbench clean
 
 help:
 	@echo "make train   train on a CPU in minutes (TASK=walker-stand, RUN_DIR=runs/TASK, ARGS=\"more settings\")"
@@ -21,7 +26,8 @@ help:
 	@echo "make test    run the tests and the examples in docstrings, JOBS=3 files at a time (ARGS=\"pytest options\")"
 	@echo "make lint    check style, format and types, as the commit hooks and CI do"
 	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
-	@echo "make clean   remove .venv, caches and build output; runs/ stays"
+	@echo "make humanoidbench   make $(HUMANOID_VENV), which simulates HumanoidBench (HUMANOID_BENCH=path of a clone)"
+	@echo "make clean   remove the environments, caches and build output; runs/ stays"
 	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
 
 # The command then speaks of RUN_DIR and ARGS, as they were typed here.
@@ -77,6 +83,23 @@ $(READY): requirements-pins.txt pyproject.toml
 	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps -e .
 	@touch $@
 
+humanoidbench: requirements-humanoidbench.txt
+	@echo "creating $(HUMANOID_VENV), with mujoco 3.1.6 and numpy below 2"
+	@rm -rf $(HUMANOID_VENV)
+	@$(PYTHON) -m venv $(HUMANOID_VENV)
+	@echo "installing pinned dependencies (about 1.6 GB, more if torch brings CUDA)"
+	@$(HUMANOID_VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements-humanoidbench.txt
+	@if [ -z "$(HUMANOID_BENCH)" ]; then \
+		echo "cloning $(HUMANOID_REPOSITORY) at $(HUMANOID_COMMIT)"; \
+		git clone -q $(HUMANOID_REPOSITORY) $(HUMANOID_VENV)/humanoid-bench && \
+		git -C $(HUMANOID_VENV)/humanoid-bench checkout -q $(HUMANOID_COMMIT); \
+	fi
+	@echo "installing humanoid_bench and torchrl_etdmpc in editable mode, without what they ask for"
+	@$(HUMANOID_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps \
+		-e "$(or $(HUMANOID_BENCH),$(HUMANOID_VENV)/humanoid-bench)" -e .
+	@echo 'train there: $(HUMANOID_VENV)/bin/python examples/train.py task=h1hand-walk preset=humanoidbench'
+	@echo 'its tests:   $(HUMANOID_VENV)/bin/python -m pytest tests/envs/test_humanoid_bench.py'
+
 clean:
-	@rm -rf $(VENV) build dist .benchmarks .hypothesis .pytest_cache .ruff_cache
+	@rm -rf $(VENV) $(HUMANOID_VENV) build dist .benchmarks .hypothesis .pytest_cache .ruff_cache
 	@find . -path ./runs -prune -o \( -name __pycache__ -o -name '*.egg-info' \) -type d -prune -exec rm -rf {} +

@@ -237,6 +237,20 @@ def test_on_a_gpu_every_entry_is_there(name):
     assert all(value.device.type == "cuda" for value in env.rollout(3).values(True, True))
 
 
+def fatal(task: Task, *, device: torch.device | str) -> EnvBase:
+    if multiprocessing.parent_process() is not None:
+        os._exit(1)
+    return own(task, device=device)
+
+
+@pytest.mark.slow  # worker processes
+def test_a_process_that_ends_before_its_environment_is_made_is_one_line():
+    task = Task("fatal-pendulum", "mine", episode_length=200, terminates=False)
+    register_task(task, fatal, replace=True)
+    with pytest.raises(RuntimeError, match=r"^a process of task .fatal-pendulum. ended before its env"):
+        make_env(task, num_envs=2)
+
+
 def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
     class LeftError(BaseException):
         pass

@@ -10,8 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchrl_etdmpc.analysis.benchmarks import HUMANOIDBENCH_HARD
-from torchrl_etdmpc.envs import Task, register_task, tasks
 from torchrl_etdmpc.suites import Experiment, Run, attempt
 from torchrl_etdmpc.suites.attempt import log_file
 
@@ -150,14 +148,3 @@ def small() -> SimpleNamespace:
         tries=tries,
         log_of=log_of,
     )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def humanoid_tasks():
-    """Stand-ins where HumanoidBench's tasks are not known."""
-    missing = [name for name in HUMANOIDBENCH_HARD if name not in tasks._tasks]
-    for name in missing:
-        register_task(Task(name, "humanoid_bench", episode_length=1000, terminates=True))
-    yield
-    for name in missing:
-        del tasks._tasks[name]

@@ -130,6 +130,7 @@ CHANGES = {
     "efficient-tdmpc": {"optim.updates_per_decision": 1, "reanalyze.every": 10},
     "efficient-tdmpc-utd2": {"optim.updates_per_decision": 2, "reanalyze.every": 5},
     "efficient-tdmpc-utd4": {},
+    "humanoidbench": {"reanalyze.beta": 10.0},
     "bmpc": {
         "model.num_dynamics": 1,
         "planner.horizon": 3,

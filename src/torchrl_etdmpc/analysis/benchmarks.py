@@ -6,24 +6,7 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from torchrl_etdmpc.envs import EASY_DMC, HARD_DMC
-
-HUMANOIDBENCH_HARD: tuple[str, ...] = (
-    "h1hand-walk",
-    "h1hand-stand",
-    "h1hand-run",
-    "h1hand-crawl",
-    "h1hand-hurdle",
-    "h1hand-maze",
-    "h1hand-sit-simple",
-    "h1hand-sit-hard",
-    "h1hand-slide",
-    "h1hand-stair",
-    "h1hand-pole",
-    "h1hand-balance-simple",
-    "h1hand-reach",
-)
-"""The 13 tasks of HumanoidBench-Hard, in the order of the thesis' Table C.5."""
+from torchrl_etdmpc.envs import EASY_DMC, HARD_DMC, HUMANOIDBENCH_HARD
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,23 @@ from torchrl_etdmpc.envs.check import check_env, check_spaces
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.make import make_env
 from torchrl_etdmpc.envs.render import render_frame
-from torchrl_etdmpc.envs.tasks import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, list_tasks, register_task
+from torchrl_etdmpc.envs.tasks import (
+    DMC_TASKS,
+    EASY_DMC,
+    HARD_DMC,
+    HUMANOIDBENCH_HARD,
+    Task,
+    get_task,
+    list_tasks,
+    register_task,
+)
 from torchrl_etdmpc.envs.user_task import import_attribute, import_task
 
 __all__ = [
     "DMC_TASKS",
     "EASY_DMC",
     "HARD_DMC",
+    "HUMANOIDBENCH_HARD",
     "Task",
     "check_env",
     "check_spaces",

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchrl.envs import DMControlEnv
 
 from torchrl_etdmpc.envs.episode import RecordedEnv
+from torchrl_etdmpc.envs.random_states import pack_mt19937, unpack_mt19937
 from torchrl_etdmpc.envs.tasks import Maker, Task
 
 __all__ = ["RecordedDMControlEnv", "dmc_maker", "domain_and_task"]
@@ -56,10 +57,10 @@ class RecordedDMControlEnv(RecordedEnv, DMControlEnv):
         return timestep.observation, timestep.reward, last and not truncated, truncated
 
     def _random_state(self) -> Tensor:
-        return _pack(self._env.task.random.get_state())
+        return pack_mt19937(self._env.task.random.get_state())
 
     def _set_random_state(self, state: Tensor) -> None:
-        self._env.task.random.set_state(_unpack(state))
+        self._env.task.random.set_state(unpack_mt19937(state))
 
     def _fingerprint(self) -> np.ndarray:
         return self.physics.get_state()
@@ -129,16 +130,3 @@ def _quiet_dm_control() -> Iterator[None]:
             yield
         finally:
             logger.removeFilter(drop)
-
-
-def _pack(state: tuple) -> Tensor:
-    """NumPy's random state as integers; the cached normal number by its bits."""
-    _, keys, position, has_gauss, cached = state
-    tail = np.array([position, has_gauss, np.float64(cached).view(np.int64)], dtype=np.int64)
-    return torch.from_numpy(np.concatenate([keys.astype(np.int64), tail]))
-
-
-def _unpack(packed: Tensor) -> tuple:
-    values = packed.numpy()
-    keys, (position, has_gauss, cached) = values[:-3].astype(np.uint32), values[-3:]
-    return "MT19937", keys, int(position), int(has_gauss), float(cached.view(np.float64))

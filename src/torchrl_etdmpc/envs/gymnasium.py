@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from torchrl_etdmpc.envs.episode import RecordedEnv
+from torchrl_etdmpc.envs.random_states import pack_pcg64, unpack_pcg64
 from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM, Maker, Task
 
 __all__ = ["RecordedGymnasiumEnv", "gymnasium_maker"]
@@ -60,10 +61,10 @@ class RecordedGymnasiumEnv(RecordedEnv, GymWrapper):
         generator = self._env.unwrapped.np_random if seed is None else seeding.np_random(seed)[0]
         repeatable = options is None and not getattr(self._env.unwrapped.spec, "nondeterministic", False)
         bits = getattr(generator, "bit_generator", None)
-        return _pack(bits.state) if repeatable and isinstance(bits, np.random.PCG64) else None
+        return pack_pcg64(bits.state) if repeatable and isinstance(bits, np.random.PCG64) else None
 
     def _set_random_state(self, state: Tensor) -> None:
-        self._env.unwrapped.np_random.bit_generator.state = _unpack(state)
+        self._env.unwrapped.np_random.bit_generator.state = unpack_pcg64(state)
 
     def _fingerprint(self) -> np.ndarray:
         data = getattr(self._env.unwrapped, "data", None)
@@ -144,16 +145,3 @@ def _require_vectors(name: str, env: Any) -> None:
         raise ValueError(f"{name} has discrete actions ({kind}); only continuous actions are supported.")
     if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
         raise ValueError(f"{name} has actions without finite bounds, so they cannot be rescaled to [-1, 1].")
-
-
-def _pack(state: dict[str, Any]) -> Tensor:
-    """The state of NumPy's PCG64, two numbers of 128 bits and two small ones, as six integers."""
-    numbers = state["state"]["state"].to_bytes(16, "little") + state["state"]["inc"].to_bytes(16, "little")
-    return torch.tensor([*np.frombuffer(numbers, np.int64).tolist(), state["has_uint32"], state["uinteger"]])
-
-
-def _unpack(packed: Tensor) -> dict[str, Any]:
-    *numbers, has_uint32, uinteger = packed.tolist()
-    raw = np.array(numbers, np.int64).tobytes()
-    state = {"state": int.from_bytes(raw[:16], "little"), "inc": int.from_bytes(raw[16:], "little")}
-    return {"bit_generator": "PCG64", "state": state, "has_uint32": has_uint32, "uinteger": uinteger}

@@ -12,13 +12,18 @@ from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv
 from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.dmc import dmc_maker
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
+from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
 from torchrl_etdmpc.envs.worker import make_in_worker, signals_held_back
 
 __all__ = ["find_maker", "make_env"]
 
 # Each says which function makes one environment of a task, or why it cannot be made on this machine.
-_SUITES: dict[str, Callable[[Task], Maker]] = {"dm_control": dmc_maker, "gymnasium": gymnasium_maker}
+_SUITES: dict[str, Callable[[Task], Maker]] = {
+    "dm_control": dmc_maker,
+    "gymnasium": gymnasium_maker,
+    "humanoid_bench": humanoid_bench_maker,
+}
 
 
 def make_env(
@@ -53,6 +58,7 @@ def make_env(
         ImportError: if the suite is missing, or cannot work with what is installed.
         ValueError: if the task or its suite is unknown, if its environment does not keep the contract, or if
             ``num_envs`` is below 1.
+        RuntimeError: if a process ended before its environment was made.
 
     >>> from torchrl_etdmpc.envs import make_env
     >>> env = make_env("walker-walk", seed=0)
@@ -77,7 +83,12 @@ def make_env(
         in_worker = partial(make_in_worker, make, os.getpid())
         env = ParallelEnv(num_envs, in_worker, device=device, num_threads=torch.get_num_threads())
         with signals_held_back():
-            env.start()
+            try:
+                env.start()
+            except EOFError:
+                raise RuntimeError(
+                    f"a process of task {task.name!r} ended before its environment was made; its own error is above."
+                ) from None
     if seed is not None:
         env.set_seed(seed)
     return env

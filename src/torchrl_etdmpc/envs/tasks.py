@@ -13,7 +13,17 @@ from typing import Any, Literal, Protocol
 import torch
 from torchrl.envs import EnvBase
 
-__all__ = ["DMC_TASKS", "EASY_DMC", "HARD_DMC", "Maker", "Task", "get_task", "list_tasks", "register_task"]
+__all__ = [
+    "DMC_TASKS",
+    "EASY_DMC",
+    "HARD_DMC",
+    "HUMANOIDBENCH_HARD",
+    "Maker",
+    "Task",
+    "get_task",
+    "list_tasks",
+    "register_task",
+]
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,33 @@ HARD_DMC: tuple[str, ...] = (
 DMC_TASKS: tuple[str, ...] = EASY_DMC + HARD_DMC
 """All 28 DeepMind Control tasks."""
 
+HUMANOIDBENCH_HARD: tuple[str, ...] = (
+    "h1hand-walk",
+    "h1hand-stand",
+    "h1hand-run",
+    "h1hand-crawl",
+    "h1hand-hurdle",
+    "h1hand-maze",
+    "h1hand-sit-simple",
+    "h1hand-sit-hard",
+    "h1hand-slide",
+    "h1hand-stair",
+    "h1hand-pole",
+    "h1hand-balance-simple",
+    "h1hand-reach",
+)
+"""The 13 tasks of HumanoidBench-Hard, in the order of the thesis' Table C.5."""
+
+# What HumanoidBench registers: every goal for every robot. An episode has 500 steps where it says so, otherwise 1,000.
+_HUMANOID_ROBOTS = ("h1", "h1hand", "h1simplehand", "h1strong", "h1touch", "g1")
+_HUMANOID_GOALS = (
+    *("stand", "walk", "run", "kitchen", "maze", "hurdle", "cube", "bookshelf-simple", "bookshelf-hard"),
+    *("highbar-simple", "highbar-hard", "crawl", "window", "spoon", "door", "push", "reach", "basketball", "truck"),
+    *("package", "cabinet", "sit-simple", "sit-hard", "balance-simple", "balance-hard", "stair", "slide", "pole"),
+    *("room", "insert-normal", "insert-small", "powerlift"),
+)
+_HUMANOID_SHORT = {"kitchen", "cube", "push", "basketball", "insert-normal", "insert-small"}
+
 INSTALL_GYMNASIUM = "pip install 'gymnasium[mujoco,classic-control]>=1.4,<2' 'mujoco<4'"
 # Gymnasium's registry does not say which tasks never terminate; in the source of gymnasium 1.4 the `step` of these, in
 # every version, always returns terminated=False. (MountainCarContinuous, for one, terminates at its goal.)
@@ -160,8 +197,8 @@ def get_task(
     """Looks a task up by its name; never imports a user's code.
 
     Args:
-        name (str): one of :data:`DMC_TASKS`, a name that :func:`register_task` knows, or ``gym/`` and any id of
-            Gymnasium, e.g. ``"gym/Pendulum-v1"``.
+        name (str): one of :data:`DMC_TASKS`, a task of HumanoidBench, e.g. ``"h1hand-walk"``, a name that
+            :func:`register_task` knows, or ``gym/`` and any id of Gymnasium, e.g. ``"gym/Pendulum-v1"``.
         action_repeat (int, optional): instead of the task's own; likewise the next two.
         episode_length (int, optional): in env steps.
         terminates (bool, optional): ``True`` for a Gymnasium task unless it is known never to terminate.
@@ -191,7 +228,12 @@ def get_task(
     if ":" in str(name):
         # A stored run or checkpoint may hold such a name, and no file may make us import code.
         raise ValueError(f"task {name!r} names code, which must be given on the command line: task={name}")
-    nearest = difflib.get_close_matches(str(name), _tasks, n=3)
+    robot, _, goal = str(name).partition("-")
+    if robot in _HUMANOID_ROBOTS and goal in _HUMANOID_GOALS:
+        length = 500 if goal in _HUMANOID_SHORT else 1000
+        return Task(name, "humanoid_bench", **({"episode_length": length, "terminates": True} | told))
+    humanoids = (f"{robot}-{goal}" for robot in _HUMANOID_ROBOTS for goal in _HUMANOID_GOALS)
+    nearest = difflib.get_close_matches(str(name), [*_tasks, *humanoids], n=3)
     hint = f"did you mean {', '.join(nearest)}? " if nearest else ""
     raise ValueError(f"unknown task {name!r}; {hint}task=list on the command line lists all.")
 
@@ -203,12 +245,14 @@ def list_tasks() -> str:
     'Easy DMC'
     """
     others = [name for name in _tasks if name not in DMC_TASKS]
-    groups = {"Easy DMC": EASY_DMC, "Hard DMC": HARD_DMC, "registered": others, "Gymnasium": _gymnasium_ids()}
+    groups = {"Easy DMC": EASY_DMC, "Hard DMC": HARD_DMC, "HumanoidBench-Hard": HUMANOIDBENCH_HARD}
+    groups |= {"registered": tuple(others), "Gymnasium": tuple(_gymnasium_ids())}
     lines = []
     for title, names in groups.items():
         if names:
             lines += [title, *_columns(names), ""]
     lines += [
+        "HumanoidBench: ROBOT-GOAL, for any other one that it has, e.g. h1-walk, h1hand-push",
         "Gymnasium: gym/ID, for any other ID with actions within bounds and one vector as observation",
         "your own: MODULE:FUNCTION, a function that returns a TorchRL environment",
     ]

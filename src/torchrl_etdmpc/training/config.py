@@ -172,10 +172,10 @@ class TrainConfig:
     """A whole run. Steps that users see are environment steps; one decision is ``action_repeat`` of them."""
 
     task: str = "walker-walk"
-    """A task of DMC, gym/ID for one of Gymnasium, or module:function for your own."""
+    """A task of DMC or HumanoidBench, gym/ID for one of Gymnasium, or module:function for your own."""
     preset: str = "efficient-tdmpc"
-    """The values to begin with: efficient-tdmpc, efficient-tdmpc-utd2, efficient-tdmpc-utd4, bmpc and tdmpc2 are for a
-    GPU, cpu and tdmpc2-cpu learn on a CPU in minutes."""
+    """The values to begin with: efficient-tdmpc, efficient-tdmpc-utd2, efficient-tdmpc-utd4, humanoidbench, bmpc and
+    tdmpc2 are for a GPU, cpu and tdmpc2-cpu learn on a CPU in minutes."""
     seed: int = 1
     """Of all random numbers."""
     total_env_steps: int = 200_000

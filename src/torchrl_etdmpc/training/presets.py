@@ -19,11 +19,11 @@ def _preset(name: str, **changes: Any) -> TrainConfig:
     return TrainConfig(preset=name, **changes)
 
 
-def _efficient_tdmpc(name: str, updates_per_decision: int, reanalyze_every: int) -> TrainConfig:
+def _efficient_tdmpc(name: str, updates_per_decision: int, reanalyze_every: int, beta: float = 0.0) -> TrainConfig:
     return _preset(
         name,
         optim=OptimConfig(updates_per_decision=updates_per_decision),
-        reanalyze=ReanalyzeConfig(every=reanalyze_every),
+        reanalyze=ReanalyzeConfig(every=reanalyze_every, beta=beta),
     )
 
 
@@ -53,6 +53,7 @@ PRESETS: dict[str, TrainConfig] = {
         _efficient_tdmpc("efficient-tdmpc", updates_per_decision=1, reanalyze_every=10),
         _efficient_tdmpc("efficient-tdmpc-utd2", updates_per_decision=2, reanalyze_every=5),
         _efficient_tdmpc("efficient-tdmpc-utd4", updates_per_decision=4, reanalyze_every=2),
+        _efficient_tdmpc("humanoidbench", updates_per_decision=4, reanalyze_every=2, beta=10.0),
         _preset(
             "bmpc",
             model=ModelConfig(num_dynamics=1),
