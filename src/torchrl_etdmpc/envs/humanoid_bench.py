@@ -35,7 +35,7 @@ class RecordedHumanoidBenchEnv(RecordedGymnasiumEnv):
     itself, which follows from its seed, so that it neither depends on what else runs in the process nor disturbs it.
     """
 
-    _numbers: tuple | None = None
+    _numbers: Any = None
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         seed = kwargs.get("seed")
@@ -50,17 +50,17 @@ class RecordedHumanoidBenchEnv(RecordedGymnasiumEnv):
 
     @contextlib.contextmanager
     def _own_numbers(self) -> Iterator[None]:
-        before = np.random.get_state()
+        before = _numpy_state()
         np.random.set_state(self._numbers or np.random.RandomState().get_state())
         try:
             yield
         finally:
-            self._numbers = np.random.get_state()
+            self._numbers = _numpy_state()
             np.random.set_state(before)
 
     def _random_state(self, seed: int | None = None, options: dict | None = None) -> Tensor | None:
         gymnasium_s = super()._random_state(seed, options)
-        return None if gymnasium_s is None else torch.cat([gymnasium_s, pack_mt19937(np.random.get_state())])
+        return None if gymnasium_s is None else torch.cat([gymnasium_s, pack_mt19937(_numpy_state())])
 
     def _set_random_state(self, state: Tensor) -> None:
         super()._set_random_state(state[:_PCG64])
@@ -68,6 +68,10 @@ class RecordedHumanoidBenchEnv(RecordedGymnasiumEnv):
 
     def _fingerprint(self) -> np.ndarray:
         return np.concatenate([super()._fingerprint(), self._observation])  # goals are in no joint
+
+
+def _numpy_state() -> Any:
+    return np.random.get_state()  # of the MT19937 that it always is, a tuple; its type has a dictionary as well
 
 
 def gymnasium_id(name: str) -> str:
