@@ -121,14 +121,15 @@ def test_a_run_that_is_killed_three_times_ends_as_if_it_had_not_been(tmp_path, t
     assert results(tmp_path / "run") == straight
 
 
-def test_a_run_on_a_task_that_terminates_is_exact_too(tmp_path, train):
+@pytest.mark.parametrize("num_envs", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_run_on_a_task_that_terminates_is_exact_too(num_envs, tmp_path, train):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
     (tmp_path / "straight").mkdir()
     (tmp_path / "killed").mkdir()
     task = "gym/InvertedPendulum-v5"
-    finish(train(tmp_path / "straight", "run_dir=run", task=task))
-    kill_and_go_on(train, tmp_path / "killed", 2, 0, task=task)
+    finish(train(tmp_path / "straight", "run_dir=run", f"num_envs={num_envs}", task=task))
+    kill_and_go_on(train, tmp_path / "killed", 2, 0, f"num_envs={num_envs}", task=task)
     straight = results(tmp_path / "straight" / "run")
     assert results(tmp_path / "killed" / "run") == straight
     assert sum(flag for (flag,) in straight["replay"]["('next', 'terminated')"]) > 10  # the head had something to learn
