@@ -36,6 +36,13 @@ def test_the_full_size_on_a_cpu_is_said_to_take_long_and_the_small_preset_is_nam
         assert "GPU" not in what_it_takes(PRESETS[small], torch.device("cpu"))
 
 
+def test_compilation_is_named_where_something_is_compiled(monkeypatch):
+    monkeypatch.setattr(module, "_flops_per_second", lambda config: 1e10)
+    cpu = torch.device("cpu")
+    assert what_it_takes(PRESETS["cpu"], cpu).endswith("before it some minutes to compile the first time")
+    assert what_it_takes(PRESETS["cpu"], cpu, compiled=False).endswith("minutes on this CPU")
+
+
 def test_an_estimate_draws_no_random_numbers():
     torch.manual_seed(0)
     before = torch.get_rng_state()

@@ -45,19 +45,20 @@ def estimated_seconds(config: TrainConfig) -> float:
     )
 
 
-def what_it_takes(config: TrainConfig, device: torch.device, env_steps: int = 0) -> str:
+def what_it_takes(config: TrainConfig, device: torch.device, env_steps: int = 0, *, compiled: bool = True) -> str:
     """How long the run will take on this machine, and what to do about it if that is long.
 
     Args:
         config (TrainConfig): the run.
         device (torch.device): its device.
         env_steps (int): what it has behind it, if it goes on. Default: 0.
+        compiled (bool): whether anything is compiled. Default: ``True``.
     """
     if device.type == "cuda":
         return f"on {torch.cuda.get_device_name(device)}"
     seconds = estimated_seconds(config) * (1 - env_steps / config.total_env_steps)
-    compiled = "" if config.compile == "off" else ", and before it some minutes to compile the first time"
-    line = f"about {_duration(seconds)} on this CPU{compiled}"
+    first = ", and before it some minutes to compile the first time" if compiled else ""
+    line = f"about {_duration(seconds)} on this CPU{first}"
     small = "tdmpc2-cpu" if config.model.action_values else "cpu"
     if config.preset not in ("cpu", "tdmpc2-cpu") and seconds > 3600:
         line += f"; preset={config.preset} is made for a GPU and there is none here: preset={small} learns in minutes"

@@ -154,7 +154,8 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
             directory.summary.unlink(missing_ok=True)  # with a longer budget the run is not finished any more
             directory.write_config(config.to_dict())
             what = f"{config.task} with preset {config.preset}"
-            takes = what_it_takes(config, run.learner.agent.device, run.env_steps)
+            agent = run.learner.agent
+            takes = what_it_takes(config, agent.device, run.env_steps, compiled=agent.compile_mode is not None)
             torchrl_logger.info(f"{what}, {config.total_env_steps:,} env steps into {directory}: {takes}")
             return run.run()
         except BaseException:
