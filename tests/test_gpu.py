@@ -52,7 +52,7 @@ def test_collecting_reanalyzing_and_updating_agree_on_the_device(storage):
     assert reanalyze.refreshed > 0
     assert all(value.isfinite() and value.is_cuda for value in metrics.values())
     eval_env = env.append_transform(agent.eval_planner.make_tensordict_primer())
-    assert evaluate(eval_env, agent.eval_planner, episodes=1, policy_device="cuda").isfinite().all()
+    assert evaluate(eval_env, agent.eval_planner, episodes=1, policy_device="cuda").returns.isfinite().all()
 
 
 @pytest.mark.parametrize("compile_mode", ["off", "auto"])

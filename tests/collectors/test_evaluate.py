@@ -80,7 +80,7 @@ def expected_return(length: int, action: float = 0.5) -> float:
 
 
 def test_a_return_is_the_sum_of_an_episode_s_rewards():
-    assert evaluate(CountingEnv(4), ConstantPolicy(), episodes=1).tolist() == [expected_return(4)]
+    assert evaluate(CountingEnv(4), ConstantPolicy(), episodes=1).returns.tolist() == [expected_return(4)]
 
 
 def test_a_return_equals_that_of_an_independent_rollout():
@@ -92,27 +92,29 @@ def test_a_return_equals_that_of_an_independent_rollout():
     env, other = (make_env("cartpole-balance", seed=3).append_transform(StepCounter(25)) for _ in range(2))
     rollout = other.rollout(100, policy)
     assert rollout.shape == (25,)
-    returns = evaluate(env, policy, episodes=1)
+    returns = evaluate(env, policy, episodes=1).returns
     torch.testing.assert_close(returns, rollout["next", "reward"].sum().reshape(1))
     assert returns.item() > 1
 
 
 def test_several_episodes_of_one_environment_are_counted_apart():
     env = CountingEnv(3)
-    assert evaluate(env, ConstantPolicy(), episodes=4).tolist() == [expected_return(3)] * 4
+    assert evaluate(env, ConstantPolicy(), episodes=4).returns.tolist() == [expected_return(3)] * 4
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 3, 4])
 def test_a_batch_of_environments_gives_as_many_returns_as_asked_for(episodes):
     single = evaluate(CountingEnv(3), ConstantPolicy(), episodes=episodes)
     batched = evaluate(side_by_side(3, 3), ConstantPolicy(), episodes=episodes)
-    assert batched.shape == (episodes,)
-    assert torch.equal(batched, single)
+    assert batched.returns.shape == batched.lengths.shape == (episodes,)
+    assert torch.equal(batched.returns, single.returns)
+    assert torch.equal(batched.lengths, single.lengths)
 
 
 @pytest.mark.parametrize("policy_device", [None, "cpu"])
 def test_only_the_first_episode_counts_where_episodes_end_at_different_times(policy_device):
-    returns = evaluate(side_by_side(2, 7, 3), ConstantPolicy(), episodes=3, policy_device=policy_device)
+    returns, lengths = evaluate(side_by_side(2, 7, 3), ConstantPolicy(), episodes=3, policy_device=policy_device)
+    assert lengths.tolist() == [2, 7, 3]
     assert returns.tolist() == [expected_return(2), expected_return(7), expected_return(3)]
 
 
@@ -136,7 +138,7 @@ def test_the_policy_acts_without_exploration_and_without_gradients(policy_device
 
 def test_on_another_device_the_policy_is_given_what_it_reads_and_no_more():
     policy = ConstantPolicy()
-    returns = evaluate(CountingEnv(3), policy, episodes=1, policy_device="cpu")
+    returns = evaluate(CountingEnv(3), policy, episodes=1, policy_device="cpu").returns
     assert returns.tolist() == [expected_return(3)]
     assert policy.inputs == [{"observation"}] * 3
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -14,12 +15,15 @@ from torchrl.envs import GymEnv  # noqa: E402
 
 from torchrl_etdmpc.envs import make_env, render_frame  # noqa: E402
 
+needs_humanoid_bench = pytest.mark.skipif(
+    importlib.util.find_spec("humanoid_bench") is None, reason="needs the environment of make humanoidbench"
+)
 _NAMES = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
 
 
 def test_rendering_a_batch_of_environments_is_refused():
     env = make_env("pendulum-swingup", num_envs=2, parallel=False)
-    with pytest.raises(ValueError, match=r"^render_frame needs one environment of dm_control or Gymnasium, got Serial"):
+    with pytest.raises(ValueError, match=r"^render_frame needs one environment of dm_control, .*Bench, got SerialEnv"):
         render_frame(env)
 
 
@@ -108,6 +112,7 @@ def _frame(task: str, options: str) -> str:
         ("pendulum-swingup", "", (384, 384, 3)),
         ("gym/Hopper-v5", "height=48, width=64", (48, 64, 3)),
         ("gym/InvertedPendulum-v5", "", (480, 480, 3)),
+        pytest.param("h1hand-walk", "height=48, width=64", (48, 64, 3), marks=needs_humanoid_bench),
     ],
 )
 def test_a_frame_is_a_uint8_image_of_the_asked_size(task, options, shape):

@@ -92,7 +92,7 @@ def test_the_planner_s_returns_are_printed_in_one_line(tmp_path, checkpoint, run
     agent, _, _ = load_agent(checkpoint)
     env = make_env("cartpole-balance", seed=5).append_transform(agent.eval_planner.make_tensordict_primer())
     torch.manual_seed(5)
-    assert process.stdout == closing_line(evaluate(env, agent.eval_planner, episodes=1), "planner") + "\n"
+    assert process.stdout == closing_line(evaluate(env, agent.eval_planner, episodes=1).returns, "planner") + "\n"
 
 
 def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint, run_main):
@@ -100,7 +100,7 @@ def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint,
     assert (message, err) == (None, "")
     agent, _, _ = load_agent(checkpoint)
     env = make_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
-    assert out == closing_line(evaluate(env, BarePolicy(agent.world_model), episodes=2), "bare") + "\n"
+    assert out == closing_line(evaluate(env, BarePolicy(agent.world_model), episodes=2).returns, "bare") + "\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -123,7 +123,7 @@ def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, r
     env = make_env(config.task_spec, seed=5, num_envs=2, parallel=False)
     env = env.append_transform(agent.eval_planner.make_tensordict_primer())
     torch.manual_seed(5)
-    line = closing_line(evaluate(env, agent.eval_planner, episodes=2), "planner")
+    line = closing_line(evaluate(env, agent.eval_planner, episodes=2).returns, "planner")
     assert out == line.replace("cartpole-balance", "gym/Pendulum-v1") + "\n"
 
 
@@ -157,7 +157,7 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main):
     message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "device=cpu", "video=a.mp4")
     assert (message, err) == (None, "")
     agent, config, _ = load_agent(checkpoint)
-    first = evaluate(make_env(config.task_spec, seed=0), BarePolicy(agent.world_model), episodes=1)
+    first = evaluate(make_env(config.task_spec, seed=0), BarePolicy(agent.world_model), episodes=1).returns
     assert first.item() < 200  # every decision upright is worth 1
     env = make_env(config.task_spec, seed=0)
     env.reset()  # as the script does, to see whether this machine can render

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
+import re
 import runpy
 import sys
 from collections.abc import Callable, Iterator
@@ -147,6 +148,19 @@ def test_a_task_of_the_user_s_own_file_is_trained_gone_on_with_evaluated_and_exp
         assert (tmp_path / "imported").exists()
     assert [row["env_steps"] for row in read_rows(tmp_path / "run" / "eval.csv")] == ["0", "140", "160"]
     assert (tmp_path / "exported" / "planner.pt2").exists()
+
+
+def test_where_episodes_can_end_early_their_lengths_and_successes_are_reported(tmp_path, run_main):
+    pytest.importorskip("mujoco")
+    message, _ = run_main("train.py", "task=gym/InvertedPendulum-v5", *SMALL_RUN, "run_dir=run")
+    assert message is None
+    rows = read_rows(tmp_path / "run" / "eval.csv")
+    assert list(rows[0])[-3:] == ["episodes", "length_mean", "success"]
+    # 1 for every step on its feet, and 0 for the one that falls.
+    assert all(float(row["length_mean"]) == float(row["return_mean"]) + 1 for row in rows)
+    message, out = run_main("evaluate.py", "checkpoint=run/checkpoints/last.pt", "episodes=2", "device=cpu")
+    assert message is None
+    assert re.search(r"over 2 episodes of \d+ decisions in the mean, 0 of them at 950 or more, a success\n$", out)
 
 
 def test_a_task_that_terminates_against_its_word_is_an_error_that_names_the_remedy(run_main):

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 import random
 
 import numpy as np
@@ -79,10 +78,10 @@ def test_an_evaluation_that_is_left_leaves_the_random_numbers_too(agent):
 def test_the_policy_without_the_planner_plays_the_same_episodes(agent):
     with_policy, without = make_evaluator(agent, with_policy=True)(), make_evaluator(agent)()
     assert with_policy[:3] == without[:3]
-    assert math.isnan(without.policy_return)
+    assert without.policy_return is None
     evaluator = make_evaluator(agent)
     evaluator.env.set_seed(5)
-    expected = evaluate(evaluator.env, BarePolicy(agent.world_model), episodes=3).mean().item()
+    expected = evaluate(evaluator.env, BarePolicy(agent.world_model), episodes=3).returns.mean().item()
     assert with_policy.policy_return == expected != with_policy.return_mean
 
 
@@ -90,6 +89,21 @@ def test_the_result_is_that_of_the_planner(agent):
     evaluator = make_evaluator(agent)
     torch.manual_seed(5)
     evaluator.env.set_seed(5)
-    returns = evaluate(evaluator.env, agent.eval_planner, episodes=3)
+    returns = evaluate(evaluator.env, agent.eval_planner, episodes=3).returns
     expected = EvaluationResult(returns.mean().item(), returns.std(correction=0).item(), 3)
     assert evaluator()[:3] == expected[:3]
+
+
+def test_lengths_and_success_are_reported_where_they_are_asked_for(agent):
+    returns = make_evaluator(agent)
+    torch.manual_seed(5)
+    returns.env.set_seed(5)
+    played = evaluate(returns.env, agent.eval_planner, episodes=3).returns
+    middle = played.sort().values[1].item()
+    result = make_evaluator(agent, with_lengths=True, success_return=middle)()
+    assert result.length_mean == 12
+    assert result.success == pytest.approx(2 / 3)
+    assert make_evaluator(agent, success_return=played.max().item() + 1)().success == 0
+    plain = make_evaluator(agent)()
+    assert plain[:3] == result[:3]
+    assert (plain.length_mean, plain.success) == (None, None)

@@ -1,7 +1,7 @@
 """Acting in environments: collection one step at a time, and evaluation."""
 
-from torchrl_etdmpc.collectors.evaluate import evaluate
+from torchrl_etdmpc.collectors.evaluate import Episodes, evaluate
 from torchrl_etdmpc.collectors.seed_policy import SeedPolicy
 from torchrl_etdmpc.collectors.step import NonFiniteError, SimulatorError, StepCollector
 
-__all__ = ["NonFiniteError", "SeedPolicy", "SimulatorError", "StepCollector", "evaluate"]
+__all__ = ["Episodes", "NonFiniteError", "SeedPolicy", "SimulatorError", "StepCollector", "evaluate"]

@@ -1,14 +1,24 @@
-"""Returns of whole episodes, without exploration."""
+"""Whole episodes, without exploration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
+
+
+class Episodes(NamedTuple):
+    """What the episodes of an evaluation came to."""
+
+    returns: Tensor
+    """Undiscounted return of each, float32 ``[episodes]``."""
+    lengths: Tensor
+    """Decisions of each, int64 ``[episodes]``."""
 
 
 @torch.no_grad()
@@ -19,8 +29,8 @@ def evaluate(
     episodes: int,
     policy_device: torch.device | str | None = None,
     on_step: Callable[[TensorDictBase], None] | None = None,
-) -> Tensor:
-    """Undiscounted returns of whole episodes, acting without exploration noise.
+) -> Episodes:
+    """Plays whole episodes, acting without exploration noise.
 
     A batched environment runs its episodes side by side: one planning call per step serves all of them.
 
@@ -33,7 +43,7 @@ def evaluate(
         on_step (callable, optional): called with the tensordict of every step, e.g. to render a frame.
 
     Returns:
-        Tensor: the return of each episode, shape ``[episodes]``.
+        Episodes: the return and the length of each, shape ``[episodes]``.
 
     Raises:
         ValueError: if ``episodes`` is not positive.
@@ -43,11 +53,12 @@ def evaluate(
     num_envs = max(env.batch_size.numel(), 1)
     if policy_device is not None and torch.device(policy_device) == env.device:
         policy_device = None
-    returns: list[Tensor] = []
+    rounds: list[Episodes] = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        while len(returns) * num_envs < episodes:
-            returns.append(_round(env, policy, num_envs, policy_device, on_step))
-    return torch.cat(returns)[:episodes]
+        while len(rounds) * num_envs < episodes:
+            rounds.append(_round(env, policy, num_envs, policy_device, on_step))
+    returns, lengths = (torch.cat(parts)[:episodes] for parts in zip(*rounds, strict=True))
+    return Episodes(returns, lengths)
 
 
 def _round(
@@ -56,10 +67,10 @@ def _round(
     num_envs: int,
     policy_device: torch.device | str | None,
     on_step: Callable[[TensorDictBase], None] | None,
-) -> Tensor:
+) -> Episodes:
     """The first episode of every environment."""
     tensordict = env.reset()
-    total = torch.zeros(num_envs)
+    total, length = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.int64)
     running = torch.ones(num_envs, dtype=torch.bool)
     while running.any():
         if policy_device is None:
@@ -70,7 +81,8 @@ def _round(
             tensordict = tensordict.update(outputs.to(env.device or "cpu"))
         stepped, tensordict = env.step_and_maybe_reset(tensordict)
         total += torch.where(running, stepped.get(("next", "reward")).reshape(num_envs).cpu(), 0)
+        length += running
         running &= ~stepped.get(("next", "done")).reshape(num_envs).cpu()
         if on_step is not None:
             on_step(stepped)
-    return total
+    return Episodes(total, length)

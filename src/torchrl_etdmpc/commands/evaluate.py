@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,10 +11,10 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
-from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame
+from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame, success_return
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
 from torchrl_etdmpc.training import TrainConfig, load_agent, read_agent_file, resolve_device
@@ -106,14 +107,23 @@ def main(config: EvaluateConfig) -> None:
     if config.video:
         env.reset()
         render_frame(env, *size)  # fails here, before the episodes, if this machine cannot render
-    returns = evaluate(
+    played = evaluate(
         env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
     )
     if config.video:
         write_film(frames, config.video, fps=FRAMES_PER_SECOND)
     env.close(raise_if_closed=False)
-    spread = returns.std(correction=0).item()
-    print(
+    print(_outcome(config, task, played, counters) + (f"; film in {config.video}" if config.video else ""))
+
+
+def _outcome(config: EvaluateConfig, task: Task, played: Episodes, counters: Mapping[str, int | float]) -> str:
+    returns, least = played.returns, success_return(task)
+    said = (
         f"{task.name} ({config.policy}, trained for {counters['env_steps']} env steps): return {returns.mean():.1f} "
-        f"+- {spread:.1f} over {len(returns)} episodes" + (f"; film in {config.video}" if config.video else "")
+        f"+- {returns.std(correction=0):.1f} over {len(returns)} episodes"
     )
+    if task.terminates:
+        said += f" of {played.lengths.float().mean():.0f} decisions in the mean"
+    if least is not None:
+        said += f", {int((returns >= least).sum())} of them at {least:g} or more, a success"
+    return said

@@ -6,6 +6,7 @@ from torchrl_etdmpc.envs.check import check_env, check_spaces
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.make import make_env
 from torchrl_etdmpc.envs.render import render_frame
+from torchrl_etdmpc.envs.success import success_return
 from torchrl_etdmpc.envs.tasks import (
     DMC_TASKS,
     EASY_DMC,
@@ -35,4 +36,5 @@ __all__ = [
     "register_task",
     "render_frame",
     "simulator_state",
+    "success_return",
 ]

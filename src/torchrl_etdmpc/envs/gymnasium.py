@@ -92,6 +92,13 @@ def gymnasium_maker(task: Task) -> Maker:
     return partial(_make, spec)
 
 
+def gymnasium_success_return(task: Task) -> float | None:
+    """The return that Gymnasium calls solved; ``None`` for a task without one."""
+    import gymnasium
+
+    return gymnasium.spec(task.name.removeprefix("gym/")).reward_threshold
+
+
 def _make(spec: Any, task: Task, *, device: torch.device | str) -> RecordedGymnasiumEnv:
     import gymnasium
     from gymnasium.envs.registration import load_env_creator

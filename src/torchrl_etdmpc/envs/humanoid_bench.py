@@ -36,6 +36,29 @@ class RecordedHumanoidBenchEnv(RecordedGymnasiumEnv):
     """
 
     _numbers: Any = None
+    _renderer: Any = None
+
+    def frame(self, height: int, width: int) -> np.ndarray:
+        """What the task's camera sees, uint8 [height, width, 3].
+
+        The package's own renderer opens with the environment, on machines that train and cannot render too; this one
+        opens with the first frame.
+        """
+        import mujoco
+
+        simulator = self._env.unwrapped
+        if self._renderer is None or (self._renderer.height, self._renderer.width) != (height, width):
+            if self._renderer is not None:
+                self._renderer.close()
+            self._renderer = mujoco.Renderer(simulator.model, height, width)
+        self._renderer.update_scene(simulator.data, camera=simulator.camera_name)
+        return self._renderer.render()
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        super().close(raise_if_closed=raise_if_closed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         seed = kwargs.get("seed")
@@ -104,6 +127,14 @@ def humanoid_bench_maker(task: Task) -> Maker:
         names = sorted(name.removesuffix("-v0").replace("_", "-") for name in known)
         raise ValueError(f"HumanoidBench has no task {task.name!r}; it has {', '.join(names)}.")
     return partial(_make, known[gymnasium_id(task.name)])
+
+
+def humanoid_bench_success_return(task: Task) -> float:
+    """The return that the package draws as a task's success (arXiv:2403.10506, dashed lines)."""
+    humanoid_bench_maker(task)  # what is missing is said as it is when the task is made
+    from humanoid_bench.env import TASKS  # pyright: ignore[reportMissingImports]
+
+    return float(TASKS[task.name.partition("-")[2].replace("-", "_")].success_bar)
 
 
 def _registered() -> dict[str, Any]:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.envs import DMControlEnv, EnvBase, GymWrapper, TransformedEnv
 
+from torchrl_etdmpc.envs.humanoid_bench import RecordedHumanoidBenchEnv
 from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM
 
 __all__ = ["render_frame"]
 
 _DMC_SIZE = 384
+_HUMANOID_SIZE = (384, 384)
 # Camera 0 of the quadruped looks from straight above; 2 follows it from the side.
 _CAMERAS = {"quadruped": 2}
 # What MUJOCO_GL may say for "no rendering".
@@ -26,10 +29,12 @@ def render_frame(
     """Renders the present state of an environment that :func:`~torchrl_etdmpc.envs.make_env` made.
 
     Args:
-        env (EnvBase): a single environment of dm_control or Gymnasium, possibly with more transforms around it.
-        height (int, optional): height of the frame in pixels. dm_control: up to the model's limit (480 unless the model
-            says otherwise), 384 by default. Gymnasium draws in a size of its own, which is the default, and is resized.
-        width (int, optional): likewise; dm_control's limit is 640 unless the model says otherwise.
+        env (EnvBase): a single environment of dm_control, Gymnasium or HumanoidBench, possibly with more transforms
+            around it.
+        height (int, optional): height of the frame in pixels. dm_control and HumanoidBench: up to the model's limit
+            (480 unless the model says otherwise), 384 by default. Gymnasium draws in a size of its own, which is the
+            default, and is resized.
+        width (int, optional): likewise; the model's limit is 640 unless it says otherwise.
         camera_id (int, optional): which camera of dm_control's model; ``None`` is one that follows the body.
 
     Returns:
@@ -53,7 +58,10 @@ def render_frame(
     if isinstance(base, DMControlEnv):
         return _dm_control_frame(base, *_size(height, width, (_DMC_SIZE, _DMC_SIZE)), camera_id)
     if not isinstance(base, GymWrapper):
-        raise ValueError(f"render_frame needs one environment of dm_control or Gymnasium, got {type(base).__name__}.")
+        kind = type(base).__name__
+        raise ValueError(f"render_frame needs one environment of dm_control, Gymnasium or HumanoidBench, got {kind}.")
+    if isinstance(base, RecordedHumanoidBenchEnv):
+        return _humanoid_frame(base, *_size(height, width, _HUMANOID_SIZE), camera_id)
     if camera_id is not None:
         raise ValueError(f"camera_id is for dm_control; Gymnasium chooses its own camera, got camera_id={camera_id}.")
     return _gymnasium_frame(base, height, width)
@@ -61,12 +69,7 @@ def render_frame(
 
 def _dm_control_frame(base: DMControlEnv, height: int, width: int, camera_id: int | None) -> Tensor:
     camera_id = _CAMERAS.get(base.env_name, 0) if camera_id is None else camera_id
-    limits = base.physics.model.vis.global_
-    if not (1 <= height <= limits.offheight and 1 <= width <= limits.offwidth):
-        raise ValueError(
-            f"frames of {base.env_name} must be 1 to {limits.offheight} pixels high and 1 to {limits.offwidth} wide, "
-            f"got height={height}, width={width}."
-        )
+    _require_size(base.env_name, base.physics.model.vis.global_, height, width)
     _require_backend()
     try:
         frame = base.physics.render(height=height, width=width, camera_id=camera_id)
@@ -75,6 +78,26 @@ def _dm_control_frame(base: DMControlEnv, height: int, width: int, camera_id: in
     except Exception as error:  # every GL backend has its own error types
         raise RuntimeError(_cannot_render(str(error).rstrip("."))) from error
     return torch.from_numpy(frame.copy())
+
+
+def _humanoid_frame(base: RecordedHumanoidBenchEnv, height: int, width: int, camera_id: int | None) -> Tensor:
+    if camera_id is not None:
+        raise ValueError(f"camera_id is for dm_control; HumanoidBench's tasks name theirs, got camera_id={camera_id}.")
+    limits = base._env.unwrapped.model.vis.global_
+    _require_size(base._env.unwrapped.spec.id, limits, height, width)
+    _require_backend()
+    try:
+        return torch.from_numpy(base.frame(height, width).copy())
+    except Exception as error:  # every GL backend has its own error types
+        raise RuntimeError(_cannot_render(str(error).rstrip("."))) from error
+
+
+def _require_size(name: str, limits: Any, height: int, width: int) -> None:
+    if not (1 <= height <= limits.offheight and 1 <= width <= limits.offwidth):
+        raise ValueError(
+            f"frames of {name} must be 1 to {limits.offheight} pixels high and 1 to {limits.offwidth} wide, "
+            f"got height={height}, width={width}."
+        )
 
 
 def _gymnasium_frame(base: GymWrapper, height: int | None, width: int | None) -> Tensor:

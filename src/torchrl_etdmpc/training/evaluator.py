@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
 
-from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.training.agent import Agent
 
 
 class EvaluationResult(NamedTuple):
-    """What one evaluation measured, as ``eval.csv`` names it."""
+    """What one evaluation measured, as ``eval.csv`` names it; ``None``: it was not asked for."""
 
     return_mean: float
     return_std: float
     episodes: int
-    policy_return: float = math.nan
-    """Mean return of the policy without the planner, if it was asked for."""
+    length_mean: float | None = None
+    """Mean number of decisions of an episode."""
+    success: float | None = None
+    """Share of the episodes whose return reaches that of a success."""
+    policy_return: float | None = None
+    """Mean return of the policy without the planner."""
 
 
 class Evaluator:
@@ -40,14 +43,29 @@ class Evaluator:
         episodes (int): how many.
         seed (int): of the episodes.
         with_policy (bool): whether the policy without the planner plays them too. Default: ``False``.
+        with_lengths (bool): whether the episodes' lengths are reported. Default: ``False``.
+        success_return (float, optional): the return from which an episode is a success; see
+            :func:`~torchrl_etdmpc.envs.success_return`. Default: ``None``, no success is reported.
     """
 
-    def __init__(self, env: EnvBase, agent: Agent, *, episodes: int, seed: int, with_policy: bool = False) -> None:
+    def __init__(
+        self,
+        env: EnvBase,
+        agent: Agent,
+        *,
+        episodes: int,
+        seed: int,
+        with_policy: bool = False,
+        with_lengths: bool = False,
+        success_return: float | None = None,
+    ) -> None:
         self.env = env.append_transform(agent.eval_planner.make_tensordict_primer())
         self.agent = agent
         self.episodes = episodes
         self.seed = seed
         self.with_policy = with_policy
+        self.with_lengths = with_lengths
+        self.success_return = success_return
 
     def __call__(self, on_step: Callable[[TensorDictBase], None] | None = None) -> EvaluationResult:
         """Evaluates the agent as it is now.
@@ -57,14 +75,19 @@ class Evaluator:
         """
         device = self.agent.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            returns = self._play(self.agent.eval_planner, on_step)
-            result = EvaluationResult(returns.mean().item(), returns.std(correction=0).item(), len(returns))
-            if not self.with_policy:
-                return result
-            bare = self._play(BarePolicy(self.agent.acting_model), on_step)
-        return result._replace(policy_return=bare.mean().item())
+            played = self._play(self.agent.eval_planner, on_step)
+            bare = self._play(BarePolicy(self.agent.acting_model), on_step) if self.with_policy else None
+        returns, least = played.returns, self.success_return
+        return EvaluationResult(
+            returns.mean().item(),
+            returns.std(correction=0).item(),
+            len(returns),
+            length_mean=played.lengths.float().mean().item() if self.with_lengths else None,
+            success=None if least is None else (returns >= least).float().mean().item(),
+            policy_return=None if bare is None else bare.returns.mean().item(),
+        )
 
-    def _play(self, policy: nn.Module, on_step: Callable[[TensorDictBase], None] | None) -> Tensor:
+    def _play(self, policy: nn.Module, on_step: Callable[[TensorDictBase], None] | None) -> Episodes:
         torch.manual_seed(self.seed)
         self.env.set_seed(self.seed)
         return evaluate(self.env, policy, episodes=self.episodes, policy_device=self.agent.device, on_step=on_step)

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.checkpoints import Part
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.envs import success_return
 from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
 from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent
 from torchrl_etdmpc.training.config import TrainConfig
@@ -61,6 +62,8 @@ class TrainingRun:
             episodes=config.eval_episodes,
             seed=(config.seed + 10_000) % 2**32,  # other episodes than those of training
             with_policy=config.eval_policy,
+            with_lengths=config.task_spec.terminates,
+            success_return=success_return(config.task_spec),
         )
         self.state = RunState()
         self.stop = StopSignals() if stop is None else stop
@@ -236,9 +239,7 @@ class TrainingRun:
             return
         self.state.eval_returns.append(result.return_mean)
         self.best.note(result.return_mean)
-        row = result._asdict()
-        if not self.config.eval_policy:
-            del row["policy_return"]
+        row = {name: value for name, value in result._asdict().items() if value is not None}
         self.log.log_eval(row, **self.counters())
 
     def _on_evaluation_step(self, progress: ProgressBar) -> None:
