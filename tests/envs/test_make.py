@@ -286,3 +286,18 @@ def test_a_process_that_is_just_starting_answers_a_signal_when_it_is_ready():
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate("\n", timeout=60)
     assert (process.returncode, out.split()) == (0, ["importing", "SIGINT"])
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs POSIX signals")
+def test_signals_stay_held_back_when_the_first_semaphore_is_made():
+    """It starts the process that tracks semaphores, after which Python unblocks SIGINT and SIGTERM."""
+    program = (
+        "import multiprocessing, signal\n"
+        "from torchrl_etdmpc.envs.worker import signals_held_back\n"
+        "with signals_held_back():\n"
+        "    multiprocessing.get_context('spawn').Event()\n"
+        "    held = signal.pthread_sigmask(signal.SIG_BLOCK, [])\n"
+        "print({signal.SIGINT, signal.SIGTERM, signal.SIGUSR1} <= held, signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
+    )
+    process = subprocess.run([sys.executable, "-c", program], text=True, capture_output=True, check=True)
+    assert process.stdout.split() == ["True", "set()"]

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
+from torchrl_etdmpc.envs.worker import start_workers_anew
 from torchrl_etdmpc.keys import TRAJECTORY
 from torchrl_etdmpc.runs.errors import first_line
 
@@ -190,11 +191,12 @@ class StepCollector(BaseCollector):
         return stepped
 
     def _ask(self, method: Callable[..., Any], *args: Any) -> Any:
-        """Calls the environment; its exceptions end the episode and not the program."""
+        """Calls the environment; its exceptions end the episode and not the program, whose processes start anew."""
         try:
             return method(*args)
         except Exception as error:
             self._truncate_episodes()
+            start_workers_anew(self.env)
             raise SimulatorError(
                 f"the environment failed at decision step {self._frames}: {first_line(error)}"
             ) from error

@@ -14,7 +14,7 @@ from torchrl_etdmpc.envs.dmc import dmc_maker
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
 from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
-from torchrl_etdmpc.envs.worker import make_in_worker, signals_held_back
+from torchrl_etdmpc.envs.worker import make_in_worker, start_workers
 
 __all__ = ["find_maker", "make_env"]
 
@@ -24,6 +24,10 @@ _SUITES: dict[str, Callable[[Task], Maker]] = {
     "gymnasium": gymnasium_maker,
     "humanoid_bench": humanoid_bench_maker,
 }
+
+# How long closed processes may take to end by themselves, in seconds. They often hang in their last moment, and TorchRL
+# would wait for 10.
+_SHUTDOWN_S = 2
 
 
 def make_env(
@@ -81,14 +85,15 @@ def make_env(
     else:
         # Left alone, ParallelEnv would change this process' own number of threads.
         in_worker = partial(make_in_worker, make, os.getpid())
-        env = ParallelEnv(num_envs, in_worker, device=device, num_threads=torch.get_num_threads())
-        with signals_held_back():
-            try:
-                env.start()
-            except EOFError:
-                raise RuntimeError(
-                    f"a process of task {task.name!r} ended before its environment was made; its own error is above."
-                ) from None
+        env = ParallelEnv(
+            num_envs, in_worker, device=device, num_threads=torch.get_num_threads(), shutdown_timeout=_SHUTDOWN_S
+        )
+        try:
+            start_workers(env)
+        except EOFError:
+            raise RuntimeError(
+                f"a process of task {task.name!r} ended before its environment was made; its own error is above."
+            ) from None
     if seed is not None:
         env.set_seed(seed)
     return env

@@ -9,10 +9,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from multiprocessing import resource_tracker
 from typing import Any, TextIO
 
-from torchrl.envs import EnvBase
+import torch
+from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 
+# How long a worker process may take for a step, in seconds.
+_PATIENCE_S = 300
 # How long a worker process outlives a signal to stop, in seconds.
 _GRACE_S = 10
 _SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)}
@@ -27,6 +31,7 @@ def signals_held_back() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    resource_tracker.ensure_running()  # starting it would let SIGINT and SIGTERM through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # processes inherit it
     try:
         yield
@@ -40,6 +45,45 @@ def take_signals(handler: Any) -> None:
         signal.signal(number, handler)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+
+
+def start_workers(env: ParallelEnv) -> None:
+    """Starts the processes of an environment; one that is silent for five minutes counts as failed.
+
+    TorchRL waits for 10,000 seconds, unless the environment variable ``BATCHED_PIPE_TIMEOUT`` says otherwise.
+    """
+    with signals_held_back():
+        env.start()
+    if "BATCHED_PIPE_TIMEOUT" not in os.environ:
+        env.BATCHED_PIPE_TIMEOUT = _PATIENCE_S
+
+
+def start_workers_anew(env: EnvBase) -> bool:
+    """After a failure: ends the processes of a :class:`~torchrl.envs.ParallelEnv` and starts new ones.
+
+    One that died, hangs or has answered half a question would fail every later step, too. The new ones get new seeds,
+    drawn from PyTorch's generator.
+
+    Args:
+        env (EnvBase): with any transforms around it.
+
+    Returns:
+        bool: whether it steps in processes of its own.
+    """
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    if not isinstance(env, ParallelEnv) or env.is_closed or not env._owns_workers:
+        return False
+    for process in env._workers:
+        with contextlib.suppress(ValueError):  # closed by now
+            process.kill()
+            process.join()
+    for channel in env.parent_channels:
+        channel.close()
+    env.is_closed = True
+    start_workers(env)
+    env.set_seed(int(torch.randint(2**31, ())))
+    return True
 
 
 def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
