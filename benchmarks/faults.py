@@ -1,6 +1,7 @@
 """Kills, signals, flipped bits, settings: a run ends as if nothing had happened, or says in a line what is wrong.
 
-    python benchmarks/faults.py kills --number 300   # real processes, stopped at random moments from their imports on
+    python benchmarks/faults.py kills --number 300   # real processes, stopped at random moments from their imports on;
+                                                     # --kind "one environment" for a part of them
     python benchmarks/faults.py flips --number 20000 # in any file of a run that is gone on with
     python benchmarks/faults.py settings --number 2000
 
@@ -9,7 +10,7 @@ has finished, and stopped by SIGKILL, SIGTERM, SIGINT or SIGUSR1 at random momen
 or end with an unknown code; at the end curves, weights, best weights and buffer must be those of a run left alone.
 *flips*: one bit anywhere in the directory of a run; what is restored must be the newest checkpoint or an older one, to
 the last bit, or an error in one line. *settings*: values that make no sense, drawn as in
-`tests/commands/test_random_settings.py`. All write `benchmarks/results/cpu/faults/<name>.json`. POSIX only.
+`tests/commands/test_random_settings.py`. All write to `benchmarks/results/cpu/faults/`. POSIX only.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,7 @@ SETTINGS = {
 }
 KINDS = {"one environment": {"compile": "off"}, "three environments": {"compile": "off", "num_envs": 3}}
 KINDS |= {"compiled": {"compile": "default"}}
+SHARES = {"one environment": 0.55, "three environments": 0.4, "compiled": 0.05}  # of all kills
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 EXPECTED = {0, EXIT_CODE, 130} | {-number for number in SIGNALS} | {128 + number for number in SIGNALS}
 LIMIT_S = 600
@@ -159,51 +161,45 @@ class Complaints(list[str]):
         super().append(text)
 
 
-def kills(number: int, seed: int, folder: Path) -> dict[str, Any]:
-    chance, done, complaints = random.Random(seed), Counter(), Complaints()
+def kills(number: int, seed: int, folder: Path, kind: str) -> dict[str, Any]:
+    chance, stopped, complaints = random.Random(f"{kind} {seed}"), 0, Complaints()
     codes: Counter[str] = Counter()
-    straight: dict[str, tuple[dict[str, Any], float]] = {}
-    series, equal = 0, 0
-    share = {"one environment": 0.55, "three environments": 0.4, "compiled": 0.05}
-    for kind, changes in KINDS.items():
-        for run_dir in (folder / "first", folder / "second"):  # the first one fills the compilation cache
-            code, text, seconds = run_once(run_dir, changes, None)
-            if code:
-                raise RuntimeError(text)
-            straight[kind] = results(run_dir), seconds
+    series, equal, changes = 0, 0, KINDS[kind]
+    for run_dir in (folder / "first", folder / "second"):  # the first one fills the compilation cache
+        code, text, alone_s = run_once(run_dir, changes, None)
+        if code:
+            raise RuntimeError(text)
+        expected = results(run_dir)
+        shutil.rmtree(run_dir)
+    print(f"{kind}: {alone_s:.0f} s when left alone", flush=True)
+    while stopped < number:
+        run_dir = folder / f"series-{series}"
+        series += 1
+        for attempt in range(40):
+            last = attempt == 39 or stopped >= number
+            stop = None if last else (chance.uniform(0, 1.1 * alone_s), chance.choice(SIGNALS))
+            code, text, _ = run_once(run_dir, changes, stop)
+            codes[signal.Signals(-code).name if code < 0 else str(code)] += 1
+            what = f"{kind}, series {series}, attempt {attempt}, {stop}, code {code}"
+            bad = any(word in text for word in ("Traceback", "Exception ignored", "Orphans"))
+            if bad or code not in EXPECTED:
+                complaints.append(f"{what}: {text[-2000:]}")
+            stopped += stop is not None and code != 0
+            if code == 0:
+                break
+        try:
+            same = results(run_dir) == expected
+        except Exception as error:
+            same = False
+            complaints.append(f"{kind}, series {series}: {error}")
+        equal += same
+        if not same:
+            shutil.move(run_dir, folder / f"different-{series}")
+            complaints.append(f"{kind}, series {series}: another end than the run that was left alone")
+        else:
             shutil.rmtree(run_dir)
-        print(f"{kind}: {straight[kind][1]:.0f} s when left alone", flush=True)
-        while done[kind] < share[kind] * number:
-            run_dir = folder / f"series-{series}"
-            series += 1
-            expected, seconds = straight[kind]
-            for attempt in range(40):
-                last = attempt == 39 or done[kind] >= share[kind] * number
-                stop = None if last else (chance.uniform(0, 1.1 * seconds), chance.choice(SIGNALS))
-                code, text, _ = run_once(run_dir, changes, stop)
-                codes[signal.Signals(-code).name if code < 0 else str(code)] += 1
-                what = f"{kind}, series {series}, attempt {attempt}, {stop}, code {code}"
-                bad = any(word in text for word in ("Traceback", "Exception ignored", "Orphans"))
-                if bad or code not in EXPECTED:
-                    complaints.append(f"{what}: {text[-2000:]}")
-                done[kind] += stop is not None and code != 0
-                if code == 0:
-                    break
-            try:
-                same = results(run_dir) == expected
-            except Exception as error:
-                same = False
-                complaints.append(f"{kind}, series {series}: {error}")
-            equal += same
-            if not same:
-                shutil.move(run_dir, folder / f"different-{series}")
-                complaints.append(f"{kind}, series {series}: another end than the run that was left alone")
-            else:
-                shutil.rmtree(run_dir)
-            print(f"{sum(done.values())} stopped, {series} series, {equal} equal, {len(complaints)} bad", flush=True)
-    return {"stopped": sum(done.values()), "by_kind": done, "series": series, "equal": equal, "exit_codes": codes} | {
-        "complaints": complaints
-    }
+        print(f"{stopped} stopped, {series} series, {equal} equal, {len(complaints)} bad", flush=True)
+    return {"stopped": stopped, "series": series, "equal": equal, "exit_codes": codes, "complaints": complaints}
 
 
 # -- flips ------------------------------------------------------------------------------------------------------------
@@ -309,17 +305,30 @@ def main() -> None:
     parser.add_argument("what", choices=["kills", "flips", "settings"])
     parser.add_argument("--number", type=int)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kind", choices=KINDS, help="of kills: this kind only; the others' results are kept")
     parser.add_argument("--out", type=Path, default=RESULTS / "faults")
     arguments = parser.parse_args()
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
     number = arguments.number or {"kills": 300, "flips": 20_000, "settings": 2_000}[arguments.what]
+    if arguments.what != "kills":
+        report(arguments.out, arguments.what, measured(globals()[arguments.what], number, arguments.seed))
+        return
+    for kind in [arguments.kind] if arguments.kind else KINDS:
+        answer = measured(kills, round(SHARES[kind] * number), arguments.seed, kind=kind)
+        report(arguments.out, f"kills-{kind.replace(' ', '-')}", answer)
+
+
+def measured(measure: Callable[..., dict[str, Any]], number: int, seed: int, **options: Any) -> dict[str, Any]:
     tick = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        answer = {"seed": arguments.seed} | globals()[arguments.what](number, arguments.seed, Path(folder))
-    answer |= {"minutes": round((time.monotonic() - tick) / 60, 1), "versions": library_versions()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / f"{arguments.what}.json").write_text(json.dumps(answer, indent=1) + "\n")
+        answer = {"seed": seed} | measure(number, seed, Path(folder), **options)
+    return answer | {"minutes": round((time.monotonic() - tick) / 60, 1), "versions": library_versions()}
+
+
+def report(out: Path, name: str, answer: dict[str, Any]) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{name}.json").write_text(json.dumps(answer, indent=1) + "\n")
     print(json.dumps({name: value for name, value in answer.items() if name != "complaints"}, indent=1))
     if answer["complaints"]:
         sys.exit("error: " + "\n".join(answer["complaints"][:20]))

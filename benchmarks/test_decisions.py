@@ -14,9 +14,14 @@ from torchrl_etdmpc.runs import RunDirectory, RunLog
 from torchrl_etdmpc.training import TrainConfig, TrainingRun, build_agent, build_collector, build_replay
 
 TASK = "walker-walk"
+EPISODIC = "gym/Hopper-v5"  # its episodes end at different times
 # What a CPU can do in minutes; a GPU runs them all.
 ON_CPU = ["cpu", "efficient-tdmpc", "bmpc"]
 ON_GPU = [*ON_CPU, "efficient-tdmpc-utd2", "efficient-tdmpc-utd4"]
+
+
+def named(num_envs: int) -> str:
+    return "one environment" if num_envs == 1 else f"{num_envs} environments"
 
 
 def begin(config: TrainConfig, folder) -> TrainingRun:
@@ -63,16 +68,48 @@ def test_decision(measure, tmp_path, name, num_envs, variant):
         decide()
         assert learner.agent.updater.updates - before[0] == steps * num_envs * config.optim.updates_per_decision
         assert learner.reanalyze.refreshed > before[1]
-    environments = "one environment" if num_envs == 1 else f"{num_envs} environments"
     try:
         measure(
-            f"decision, {name}, {environments}",
+            f"decision, {name}, {named(num_envs)}",
             variant,
             decide,
             rounds=1 if large else 20,
             warmup_rounds=0 if large else 2,
             calls=steps * num_envs,
         )
+    finally:
+        learner.collector.shutdown()
+        run.evaluator.close()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("num_envs", [1, 4, 16])
+def test_decision_where_episodes_end_early(measure, tmp_path, num_envs, variant):
+    """With a termination head, slices that end with their episode, and one batched plan for all environments."""
+    replay = {"seed_decisions": 1008, "pretrain_updates": 20}
+    config = configure(
+        "cpu", variant, task=EPISODIC, num_envs=num_envs, eval_episodes=1, total_env_steps=1_000_000, replay=replay
+    )
+    run = begin(config, tmp_path)
+    learner, ended = run.learner, 0
+    steps = config.reanalyze.every
+
+    def decide() -> None:
+        nonlocal ended
+        for _ in range(steps):
+            learner.step(updates=True)
+        ended += int(learner.collector.replay_buffer[:]["next", "terminated"].sum())
+
+    try:
+        measure(
+            f"decision, cpu, episodic, {named(num_envs)}",
+            variant,
+            decide,
+            rounds=20,
+            warmup_rounds=2,
+            calls=steps * num_envs,
+        )
+        assert ended, "no episode ended early"
     finally:
         learner.collector.shutdown()
         run.evaluator.close()

@@ -44,7 +44,7 @@ _CPU_RUN: dict[str, Any] = {
     "loss": LossConfig(tau=0.03),
     "optim": OptimConfig(batch_size=64, lr=1e-3),
 }
-_CPU_MODEL: dict[str, Any] = {"latent_dim": 64, "mlp_dim": 64, "encoder_dim": 128, "activation": "silu"}
+_CPU_MODEL: dict[str, Any] = {"latent_dim": 128, "mlp_dim": 128, "encoder_dim": 128, "activation": "silu"}
 _CPU_PLANNER: dict[str, Any] = {"num_samples": 48, "num_elites": 10, "num_proposals": 4, "iterations": 3}
 
 PRESETS: dict[str, TrainConfig] = {
