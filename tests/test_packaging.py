@@ -48,9 +48,10 @@ _FLOORS = (
     },
     {
         "suites": {"analysis", "envs", "runs", "training"},
+        "inspector": {"functional", "keys", "envs", "runs", "modules", "analysis", "planners", "training"},
     },
     {
-        "commands": {"analysis", "collectors", "envs", "planners", "runs", "suites", "training"},
+        "commands": {"analysis", "collectors", "envs", "inspector", "planners", "runs", "suites", "training"},
     },
 )
 _MAY_IMPORT = {name: allowed for floor in _FLOORS for name, allowed in floor.items()}

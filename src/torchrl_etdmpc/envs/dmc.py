@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import importlib.metadata
 import importlib.util
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,22 @@ class RecordedDMControlEnv(RecordedEnv, DMControlEnv):
 
     def _fingerprint(self) -> np.ndarray:
         return self.physics.get_state()
+
+    def _simulator_bookmark(self) -> Callable[[], None]:
+        import mujoco
+
+        # All of MjData, not physics.get_state(): the solver begins from its last solution, and sensors of forces show
+        # what the last step left there.
+        data, model = self.physics.data.ptr, self.physics.model.ptr
+        saved, steps, ended = copy.copy(data), self._env._step_count, self._env._reset_next_step
+        task = copy.deepcopy(vars(self._env.task))
+
+        def lead_back() -> None:
+            mujoco.mj_copyData(data, model, saved)
+            self._env._step_count, self._env._reset_next_step = steps, ended
+            vars(self._env.task).update(copy.deepcopy(task))
+
+        return lead_back
 
 
 def dmc_maker(task: Task) -> Maker:

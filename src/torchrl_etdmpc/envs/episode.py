@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ class RecordedEnv(EnvBase):
     _random: Tensor | None = None  # as it was before the reset; None: nothing to come back to
     _actions: list[np.ndarray]
     _episode_reward: Tensor
+    restored: tuple[Tensor, bool]
+    """The place that :meth:`set_extra_state` or :meth:`go_on` led to: observation, and whether the episode is over."""
 
     @abc.abstractmethod
     def _advance(self, action: np.ndarray) -> tuple[Any, float, bool, bool]:
@@ -113,9 +116,34 @@ class RecordedEnv(EnvBase):
         if state is None:
             return
         self._set_random_state(state["random"])
-        self._reset()
-        for action in state["actions"].numpy():
-            self._decide(action.copy())
+        self.restored = self._reset().get("observation"), False
+        self.go_on(state["actions"])
+
+    def go_on(self, actions: Tensor) -> None:
+        """Takes more actions of a recorded episode, the suite's own, float64 [T, A]."""
+        for action in actions.numpy():
+            observation, _, terminated, truncated = self._decide(action.copy())
+            self.restored = self.read_obs(observation)["observation"], terminated or truncated
+
+    def bookmark(self) -> Callable[[], None] | None:
+        """A function that leads back to here, exactly and without the episode, as often as it is called.
+
+        It holds until the next reset. ``None`` where the suite has no such thing.
+        """
+        back = self._simulator_bookmark()
+        if back is None:
+            return None
+        random, actions, episode_reward = self._random, list(self._actions), self._episode_reward
+
+        def lead_back() -> None:
+            back()
+            self._random, self._actions, self._episode_reward = random, list(actions), episode_reward
+
+        return lead_back
+
+    def _simulator_bookmark(self) -> Callable[[], None] | None:
+        """:meth:`bookmark` of the suite's part."""
+        return None
 
 
 def simulator_state(env: EnvBase) -> dict[str, Any] | None:
