@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_etdmpc.inspector.studies import advantage, choose_states
+from torchrl_etdmpc.testing import LineWorld
+
+HORIZON = 5
+
+
+def true_sum(world: LineWorld, start: torch.Tensor, steps: int) -> float:
+    """Of the optimal actions for some steps, and of standing still from then on."""
+    latent, total = world.encode(start), 0.0
+    for step in range(HORIZON):
+        action = world.optimal_action(latent) if step < steps else torch.zeros(1)
+        total += world.reward(latent, action).item()
+        latent = world.transition(latent, action)
+    return total
+
+
+@pytest.fixture
+def measure(make_episodes, make_planner, WorldSimulator):
+    def run(world: LineWorld, steps: int) -> tuple[advantage.Advantage, torch.Tensor]:
+        states = choose_states(make_episodes(world, torch.zeros_like), 5, ahead=HORIZON)
+        planner = make_planner(world)
+        return advantage.advantage(planner, states, WorldSimulator(world), steps=steps, horizon=HORIZON), states
+
+    return run
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_the_planner_gains_what_the_best_actions_gain_over_a_policy_that_stands_still(measure, steps):
+    world = LineWorld(policy_gain=0.0)
+    result, states = measure(world, steps)
+    policy = [true_sum(world, start, 0) for start in states.observation]
+    planned = [true_sum(world, start, steps) for start in states.observation]
+    assert result.policy.tolist() == pytest.approx(policy, rel=1e-4)
+    assert result.planned.tolist() == pytest.approx(planned, abs=0.1)
+    assert (result.difference > 0.5).all()
+
+
+def test_nothing_is_gained_over_an_optimal_policy(measure):
+    result, _ = measure(LineWorld(policy_gain=1.0), 3)
+    assert (result.difference <= 1e-4).all()
+    assert (result.difference > -0.1).all()
+
+
+def test_the_planner_acts_within_the_horizon(measure):
+    with pytest.raises(ValueError, match=r"steps must be in 1..horizon=5, got 6"):
+        measure(LineWorld(), 6)

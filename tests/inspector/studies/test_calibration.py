@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from scipy.stats import spearmanr
+
+from torchrl_etdmpc.inspector.studies import calibration, choose_states
+from torchrl_etdmpc.testing import LineWorld
+
+
+class Unsure(LineWorld):
+    """Two heads that are wrong, and apart, by shares of how far from 0 they are."""
+
+    wrong, apart = 0.0, 0.0
+
+    def next(self, latent, action):
+        following = super().next(latent, action).clone()
+        shares = torch.tensor([self.wrong + self.apart, self.wrong - self.apart])
+        distance = latent[..., 0].abs().expand(following.shape[:-1])
+        following[..., 0] += shares.view(2, *(1,) * (following.ndim - 2)) * distance
+        return following
+
+
+@pytest.fixture
+def measure(make_episodes, make_planner, WorldSimulator):
+    def run(wrong: float, apart: float) -> calibration.Calibration:
+        world = Unsure(num_dynamics=2, policy_gain=1.0)
+        world.wrong, world.apart = wrong, apart
+        states = choose_states(make_episodes(world, torch.zeros_like, count=30, steps=2), 60, ahead=2)
+        planner = make_planner(world, num_samples=16, num_elites=4, iterations=1)
+        return calibration.calibration(planner, states, WorldSimulator(world), horizon=2)
+
+    return run
+
+
+def test_heads_that_are_apart_where_they_are_wrong_are_calibrated(measure):
+    result = measure(wrong=0.3, apart=0.1)
+    assert torch.allclose(result.error[..., 0], 3 * result.disagreement[..., 0], atol=1e-5)
+    first = [row for row in calibration.table(result) if row["depth"] == 1]
+    for row in first:
+        assert row["rank_correlation"] == pytest.approx(1, abs=0.01)
+        assert row["error_over_disagreement"] == pytest.approx(3, rel=1e-3)
+
+
+def test_heads_that_err_alike_do_not_know_it(measure):
+    result = measure(wrong=0.3, apart=0.0)
+    assert result.error[..., 0].mean() > 0.05
+    assert result.disagreement[..., 0].abs().max() < 1e-6
+
+
+def test_rank_correlation_is_spearman_s():
+    torch.manual_seed(0)
+    pairs = torch.randn(50, 3, 2)
+    pairs[:, 1] = pairs[:, 1].round()  # ties
+    pairs[:, 2, 1] = pairs[:, 2, 0].exp()
+    expected = [spearmanr(pairs[:, column, 0], pairs[:, column, 1]).statistic for column in range(3)]
+    assert calibration.rank_correlation(pairs).tolist() == pytest.approx(expected)
+    assert calibration.rank_correlation(torch.ones(5, 2)).item() == 0
+
+
+def test_one_head_is_refused(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld()
+    states = choose_states(make_episodes(world, torch.zeros_like), 4, ahead=2)
+    with pytest.raises(ValueError, match="num_dynamics must be at least 2 for heads to disagree, got 1"):
+        calibration.calibration(make_planner(world), states, WorldSimulator(world))

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_etdmpc.inspector.studies import choose_states, consistency
+from torchrl_etdmpc.testing import LineWorld
+
+MOVED = 0.3
+
+
+@pytest.fixture
+def world():
+    return LineWorld(goal=0.0, policy_gain=1.0)
+
+
+def test_a_plan_that_was_right_survives_and_one_that_was_moved_is_as_far_as_it_was_moved(
+    world, make_episodes, make_planner
+):
+    planner = make_planner(world, std_min=0.05, inverse_temperature=200.0)
+    found = {}
+    for moved in (0.0, MOVED):
+        episodes = [
+            # Everything stands at the goal, where the best plan is to stay.
+            episode._replace(
+                observation=torch.zeros_like(episode.observation),
+                plan_mean=torch.full_like(episode.plan_mean, moved),
+            )
+            for episode in make_episodes(world, torch.zeros_like)
+        ]
+        found[moved] = consistency.consistency(planner, choose_states(episodes, 9))
+    assert found[0.0].change.shape[1:] == (3, 3)
+    first = (MOVED / found[MOVED].std)[:, 0]
+    assert torch.allclose(found[MOVED].change[:, 0, 0], first, rtol=0.25)
+    assert (found[0.0].change[:, :, 0] < 1).all()
+    assert found[0.0].change[:, :2, -1].isnan().all()  # the plan before ends there
+    assert not found[0.0].change[:, 2].isnan().any()
+
+
+def test_first_decisions_are_left_out_and_states_without_plans_refused(world, make_episodes, make_planner):
+    planner, episodes = make_planner(world), make_episodes(world, world.optimal_action, steps=4)
+    states = choose_states(episodes, 100)
+    result = consistency.consistency(planner, states)
+    assert len(result.episode) == 3 * 3
+    assert len(consistency.table(result)) == 2 + 2 + 3
+    for none in (states._replace(plan_mean=None), states._replace(step=torch.zeros_like(states.step))):
+        with pytest.raises(ValueError, match="states must have plans before them, got none; play the episodes with"):
+            consistency.consistency(planner, none)

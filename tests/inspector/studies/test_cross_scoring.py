@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_etdmpc.inspector.studies import choose_states, cross_scoring
+from torchrl_etdmpc.testing import LineWorld
+
+BUDGET = {"num_samples": 256, "num_elites": 16}
+
+
+def test_one_head_s_trap_is_exploited_alone_and_seen_through_by_the_ensemble(
+    make_episodes, make_planner, WorldSimulator
+):
+    # At the goal: a wrong way and back costs 0.03 or more, for which head 0 promises 0.1, the mean of the heads 0.025.
+    world = LineWorld(goal=0.0, num_dynamics=4, trap=(-1.0, -0.5), trap_bonus=0.1, policy_gain=1.0)
+    states = choose_states(make_episodes(world, world.optimal_action), 6, ahead=3)
+    goal = torch.zeros_like(states.observation)
+    states = states._replace(observation=goal, simulator=list(goal))
+    result = cross_scoring.cross_scoring(make_planner(world), states, WorldSimulator(world), **BUDGET)
+    single, ensemble = result.gain.unbind(1)
+    assert (single[:, 0] > 0.03 * result.scale).all()  # what it believes
+    assert (single[:, 2] < -0.03 * result.scale).all()  # what happens
+    assert (ensemble[:, 2] > -0.01 * result.scale).all()
+    assert (ensemble[:, 2] <= 0).all()  # the policy is optimal
+    assert (single[:, 1] < ensemble[:, 1]).all()  # nor does the ensemble think much of it
+
+
+def test_all_estimates_agree_where_all_heads_are_exact(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=2, num_values=2, policy_gain=0.5)
+    episodes = make_episodes(world, world.optimal_action, count=8, steps=3)  # from far off the goal
+    states = choose_states(episodes, 8, ahead=3)
+    result = cross_scoring.cross_scoring(make_planner(world), states, WorldSimulator(world), decisions=60, **BUDGET)
+    assert result.returns.shape == (8, 3, 3)
+    assert torch.allclose(result.returns, result.returns[..., :1].expand_as(result.returns), atol=1e-5)
+    assert result.scale == 20
+    assert torch.allclose(result.gain[:, 0], 20 * (result.returns[:, 0] - result.returns[:, 2]))
+    assert (result.gain[:, :, 2] > 0).all()  # half of the best action is not the best
+
+
+def test_the_table_has_an_interval_around_every_gain():
+    returns = torch.rand(40, 3, 3)
+    result = cross_scoring.CrossScores(returns, 100.0, torch.arange(40) % 8)
+    rows = cross_scoring.table(result)
+    assert len(rows) == 6
+    found = next(row for row in rows if (row["found_by"], row["scored_by"]) == ("ensemble", "simulator"))
+    assert found["gain"] == pytest.approx(100 * (returns[:, 1, 2] - returns[:, 2, 2]).mean().item(), rel=1e-4)
+    assert all(row["low"] < row["gain"] < row["high"] for row in rows)

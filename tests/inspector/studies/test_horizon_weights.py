@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_etdmpc.functional import adaptive_mixture
+from torchrl_etdmpc.inspector.studies import choose_states, horizon_weights
+from torchrl_etdmpc.testing import LineWorld
+
+DISCOUNT, APART = 0.5, 0.2
+
+
+def test_the_weights_are_the_inverse_variances_where_all_depths_promise_the_same(make_episodes, make_planner):
+    # At the goal every return is 0 and the values are APART beside it: sigma of depth h is APART / sqrt(2) * 0.5^h.
+    world = LineWorld(goal=0.0, num_values=2, value_offset=[APART, -APART], policy_gain=1.0)
+    episodes = make_episodes(world, torch.zeros_like)
+    states = choose_states(episodes, 4)
+    states = states._replace(observation=torch.zeros_like(states.observation))
+    planner = make_planner(world, discount=DISCOUNT, std_min=1e-4, num_elites=8)
+    result = horizon_weights.horizon_weights(planner, states, betas=(0.0, 10.0), horizon=4)
+    assert result.weights.shape == (4, 2, 6, 4)
+    assert torch.allclose(result.weights.sum(-1), torch.ones(4, 2, 6), atol=1e-5)
+    sigma = APART * DISCOUNT ** torch.arange(1.0, 5)
+    assert torch.allclose(result.sigma[:, 1], sigma.expand(4, -1), atol=1e-4)
+    inverse = sigma.square().reciprocal()
+    assert torch.allclose(result.weights[:, 1, -1], (inverse / inverse.sum()).expand(4, -1), atol=0.01)
+    assert ((result.weights[:, 0] > 0).sum(-1) >= 1).all()
+
+
+def test_without_pessimism_the_best_depth_has_all_the_weight(make_episodes, make_planner):
+    world = LineWorld(goal=1.0, num_values=2, value_offset=[APART, -APART], policy_gain=1.0)
+    states = choose_states(make_episodes(world, world.optimal_action), 4)
+    planner = make_planner(world, num_elites=1)
+    result = horizon_weights.horizon_weights(planner, states, betas=(0.0,), horizon=3)
+    assert torch.equal(result.weights.amax(-1), torch.ones(4, 1, 6))
+    _, weights = adaptive_mixture(result.mean, result.sigma, 0.0)
+    assert torch.equal(result.weights[:, :, -1], weights)
+
+
+def test_the_table_names_every_weight_and_the_lines_the_mean_depth():
+    weights = torch.tensor([[0.5, 0.5], [0.0, 1.0]]).expand(6, 1, 2, 2)  # two iterations of two depths
+    result = horizon_weights.HorizonWeights(
+        weights, torch.ones(6, 1, 2), torch.ones(6, 1, 2), (3.0,), torch.arange(6) % 3
+    )
+    rows = horizon_weights.table(result)
+    assert [row["weight"] for row in rows] == [0.5, 0.5, 0.0, 1.0]
+    assert [row["mean"] for row in rows] == ["", "", 1.0, 1.0]
+    assert horizon_weights.lines(result) == [
+        "beta 3: mean depth 1.50 in the first iteration, 2.00 in the last, change +0.50 [+0.50, +0.50]"
+    ]
+    with pytest.raises(ValueError, match="beta"):
+        adaptive_mixture(torch.ones(2), torch.ones(2), -1.0)

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import torch
+
+from torchrl_etdmpc.inspector.studies import choose_states, latent_gallery
+from torchrl_etdmpc.testing import LineWorld
+
+DRIFT = 0.05
+
+
+def test_heads_drift_apart_step_by_step_and_their_mean_stays_true(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=2, num_values=2, drift=[[DRIFT], [-DRIFT]], policy_gain=1.0)
+    states = choose_states(make_episodes(world, world.optimal_action), 5, ahead=4)
+    planner = make_planner(world)
+    result = latent_gallery.latent_gallery(planner, states, WorldSimulator(world), horizon=4)
+    assert result.imagined.shape == (5, 2, 2, 5, 2)
+    assert result.true.shape == (5, 2, 5, 2)
+    assert result.returns.shape == (5, 2, 4, 2, 2)
+    expected = DRIFT * torch.arange(1.0, 5)
+    assert torch.allclose(result.spread, expected.expand(5, 2, -1), atol=1e-5)
+    assert torch.allclose(result.error, torch.zeros(5, 2, 4), atol=1e-5)
+    # Each head sees minus the squared distance from where it thinks it is: the mean misses the drift's square.
+    value = -(result.true[:, :, 1:, 0] - world.goal).square()
+    assert torch.allclose(result.returns.mean((-2, -1))[..., 0] + 2 * DRIFT**2, 1.99 * value[..., 0], atol=0.01)
+
+
+def test_pessimism_keeps_the_heads_together(make_episodes, make_planner, WorldSimulator):
+    class Uncertain(LineWorld):
+        """Heads that disagree about large actions."""
+
+        def next(self, latent, action):
+            following = super().next(latent, action).clone()
+            apart = torch.tensor([0.5, -0.5]).view(2, *(1,) * (following.ndim - 2))
+            following[..., 0] = following[..., 0] + apart * action[..., 0].square()
+            return following
+
+    world = Uncertain(goal=2.0, num_dynamics=2, policy_gain=1.0)
+    states = choose_states(make_episodes(world, torch.zeros_like), 6, ahead=3)
+    result = latent_gallery.latent_gallery(make_planner(world), states, WorldSimulator(world), betas=(0.0, 10.0))
+    assert (result.spread[:, 1, -1] < 0.7 * result.spread[:, 0, -1]).all()
+    assert (result.true_returns[:, 1, -1] < result.true_returns[:, 0, -1]).all()  # and costs return
+    assert len(latent_gallery.table(result)) == 2 * 3
+    assert "beta 10 over beta 0: 0." in latent_gallery.lines(result)[0]

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+
+from torchrl_etdmpc.inspector.studies.components import components
+from torchrl_etdmpc.inspector.studies.replan import (
+    best_sequences,
+    generator_of,
+    imagine,
+    policy_sequences,
+    replan,
+    return_estimates,
+    true_returns,
+    variant,
+    with_beta,
+)
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner, FinalScore, LatentEnv
+from torchrl_etdmpc.testing import LineWorld, LQRWorld
+
+# What a planner may be asked for and a variant keeps; iterations hold the extra ones.
+NOT_KEPT = {"env", "extra_iterations", "large_action_dim", "beta", "action_key", "plan_key"}
+
+
+def test_a_variant_keeps_every_setting_that_is_not_changed():
+    settings = {
+        **{"horizon": 4, "num_samples": 20, "num_elites": 5, "num_proposals": 3, "iterations": 2},
+        **{"score": FinalScore(beta=2.0), "discount": 0.9, "inverse_temperature": 0.7, "std_min": 0.1, "std_max": 1.5},
+        **{"first_action": "mean", "eval_first_action": "elite", "warm_start": False, "scoring_dtype": torch.float64},
+        **{"proposal_log_std_min": -2.5, "proposal_log_std_max": 0.5, "observation_key": "o", "latent_key": "z"},
+        **{"is_init_key": "i", "plan_mean_key": "p"},
+    }
+    assert settings.keys() == inspect.signature(EnsembleMPPIPlanner).parameters.keys() - NOT_KEPT
+    planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), **settings)
+    same, other = variant(planner), variant(planner, horizon=6)
+    for name in settings:
+        if not name.startswith("proposal"):
+            assert getattr(same, name) == settings[name], name
+    assert same.proposal_log_std_bounds == (-2.5, 0.5)
+    assert (other.horizon, other.num_samples, planner.horizon) == (6, 20, 4)
+    many = EnsembleMPPIPlanner(LatentEnv(LineWorld(action_dim=21)), num_proposals=0)
+    assert variant(many).iterations == many.iterations == 8
+    assert other.world_model is planner.world_model
+
+
+def test_a_beta_is_set_where_the_score_has_one():
+    planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), score="final")
+    assert with_beta(planner, 3).score == FinalScore(beta=3.0)
+    with pytest.raises(ValueError, match="score must be one with a beta"):
+        with_beta(variant(planner, score=lambda returns: returns.amax((-3, -2, -1))), 3)
+
+
+def test_many_states_are_planned_as_few_are(make_planner):
+    planner = make_planner(LineWorld(policy_gain=1.0))
+    observation = torch.linspace(-0.5, 0.5, 70).unsqueeze(-1)
+    plan = replan(planner, observation, generator=generator_of(planner, 0), trace=True)
+    assert plan.action.shape == (70, 1)
+    assert plan.trace.actions.shape == (70, 6, 256, 3, 1)
+    assert torch.equal(best_sequences(plan)[:, 0], plan.action)  # in evaluation the best one acts
+    again = replan(planner, observation, generator=generator_of(planner, 0))
+    assert torch.equal(again.mean, plan.mean)
+    assert again.trace is None
+    assert not torch.equal(replan(planner, observation, generator=generator_of(planner, 1)).mean, plan.mean)
+
+
+def test_the_policy_s_sequence_is_its_mean_on_the_average_of_the_heads(make_planner):
+    world = LineWorld(policy_gain=1.0, num_dynamics=2, drift=[[0.1], [-0.1]])
+    observation = torch.tensor([[-0.75], [0.6]])
+    sequences = policy_sequences(make_planner(world), observation, 4)
+    assert torch.allclose(sequences, world.optimal_actions(observation, 4))
+
+
+def test_every_head_goes_its_own_way(make_planner):
+    world = LineWorld(num_dynamics=2, drift=[[0.1], [-0.1]])
+    observation, actions = torch.zeros(5, 1), torch.ones(5, 3, 1)
+    latents = imagine(make_planner(world), observation, actions)
+    expected = torch.tensor([[0, 0.6, 1.2, 1.8], [0, 0.4, 0.8, 1.2]])
+    assert torch.allclose(latents[..., 0], expected.expand(5, -1, -1))
+
+
+def test_estimates_equal_the_truth_where_the_model_is_exact(make_planner, WorldSimulator):
+    world = LQRWorld(discount=0.9)
+    planner = make_planner(world, discount=0.9)
+    observation, actions = torch.rand(2, 2), torch.rand(2, 4, 1) * 2 - 1
+    simulator, observations, rewards = WorldSimulator(world), [], []
+    for state, sequence in zip(observation, actions, strict=True):
+        simulator.restore(state)
+        rolled = simulator.roll(sequence)
+        observations.append(rolled.observation)
+        rewards.append(rolled.reward)
+    truth = true_returns(planner, torch.stack(observations), torch.stack(rewards), torch.ones(2, 5, dtype=torch.bool))
+    estimated = return_estimates(planner, observation, actions.unsqueeze(1))
+    assert estimated.shape == (2, 1, 4, 1, 1)
+    assert torch.allclose(estimated[:, 0, :, 0, 0], truth, atol=1e-5)
+    ended = true_returns(planner, torch.stack(observations), torch.stack(rewards), torch.zeros(2, 5, dtype=torch.bool))
+    assert torch.allclose(ended[:, 0], torch.stack(rewards)[:, 0])
+
+
+def test_components_are_those_of_the_largest_spread():
+    torch.manual_seed(0)
+    hidden = torch.randn(200, 2) * torch.tensor([5.0, 2.0])
+    directions = torch.linalg.qr(torch.randn(7, 2)).Q.mT
+    coordinates, shares = components((hidden @ directions + 3).reshape(50, 4, 7))
+    assert coordinates.shape == (50, 4, 2)
+    centred = hidden - hidden.mean(0)
+    assert abs(torch.corrcoef(torch.stack([coordinates[..., 0].flatten(), centred[:, 0]]))[0, 1]) > 0.99
+    assert float(shares.sum()) == pytest.approx(1)
+    assert shares[0] > shares[1]

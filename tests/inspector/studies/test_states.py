@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_etdmpc.inspector import Rolled
+from torchrl_etdmpc.inspector.studies.states import choose_states, episode_interval, roll_all
+from torchrl_etdmpc.testing import LineWorld
+
+
+def test_states_are_drawn_without_repeats_in_the_order_of_their_episodes(make_episodes):
+    episodes = make_episodes(LineWorld(), torch.zeros_like, count=4, steps=9)
+    states = choose_states(episodes, 20, ahead=3, seed=1)
+    places = list(zip(states.episode.tolist(), states.step.tolist(), strict=True))
+    assert places == sorted(set(places))
+    assert len(places) == 20
+    assert set(states.episode.tolist()) == {0, 1, 2, 3}
+    assert int(states.step.max()) <= 9 - 3
+    for index, (episode, step) in enumerate(places):
+        assert torch.equal(states.observation[index], episodes[episode].observation[step])
+        assert torch.equal(states.simulator[index], episodes[episode].states[step])
+    assert states.plan_mean.shape == (20, 3, 1)
+    assert places != list(zip(*(f.tolist() for f in choose_states(episodes, 20, ahead=3)[-2:]), strict=True))
+
+
+def test_all_states_are_taken_where_there_are_not_enough(make_episodes):
+    episodes = make_episodes(LineWorld(), torch.zeros_like, count=2, steps=5)
+    assert len(choose_states(episodes, 100, ahead=2).step) == 2 * 4
+    assert len(choose_states(episodes, 100).step) == 2 * 5  # of every decision
+
+
+def test_no_states_are_an_error(make_episodes):
+    episodes = make_episodes(LineWorld(), torch.zeros_like, count=2, steps=5)
+    for count, ahead in ((5, 6), (0, 1)):
+        with pytest.raises(ValueError, match=f"have {ahead} decisions after them, got states={count} and episodes of"):
+            choose_states(episodes, count, ahead=ahead)
+
+
+def test_an_interval_knows_that_states_of_one_episode_are_no_independent_evidence():
+    values = torch.tensor([0.0, 1.0, 2.0, 3.0]).repeat_interleave(100)
+    episode = torch.arange(4).repeat_interleave(100)
+    together = episode_interval(values, episode)
+    apart = episode_interval(values, torch.arange(400))
+    assert together.value.item() == apart.value.item() == 1.5
+    assert together.high - together.low > 5 * (apart.high - apart.low)
+    assert 0 <= together.low < 1.5 < together.high <= 3
+
+
+def test_one_episode_has_no_interval():
+    interval = episode_interval(torch.arange(3.0), torch.zeros(3))
+    assert interval.value.item() == 1
+    assert interval.low.isnan()
+    assert interval.high.isnan()
+
+
+def test_intervals_take_any_shape_and_statistic():
+    values, episode = torch.rand(40, 2, 3), torch.arange(40) % 5
+    assert episode_interval(values, episode).low.shape == (2, 3)
+    largest = episode_interval(values, episode, lambda rows: rows.amax((0, 2)), resamples=50)
+    assert torch.equal(largest.value, values.amax((0, 2)))
+    assert (largest.low <= largest.high).all()
+
+
+def test_nothing_is_earned_after_the_end(make_episodes, WorldSimulator):
+    class Ends(WorldSimulator):
+        def roll(self, actions):
+            return Rolled(*super().roll(actions[:2])[:3], terminated=True)
+
+    world = LineWorld()
+    states = choose_states(make_episodes(world, torch.zeros_like), 3, ahead=4)
+    observation, reward, alive = roll_all(Ends(world), states, torch.ones(3, 4, 1))
+    assert torch.equal(alive, torch.tensor([[True, True, False, False, False]]).expand(3, -1))
+    assert reward[:, :2].abs().min() > 0
+    assert not reward[:, 2:].any()
+    assert torch.equal(observation[:, 2:], observation[:, 2:3].expand(-1, 3, -1))
+    whole, _, lives = roll_all(WorldSimulator(world), states, torch.ones(3, 4, 1))
+    assert lives.all()
+    assert torch.allclose(whole[:, -1] - whole[:, 0], torch.tensor(2.0))
