@@ -14,6 +14,7 @@ import yaml
 
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig
 from torchrl_etdmpc.commands.export import ExportConfig
+from torchrl_etdmpc.commands.study import StudyConfig
 from torchrl_etdmpc.envs import check_env, import_task, make_env
 from torchrl_etdmpc.training import PRESETS, DistributedConfig, TrainConfig
 from torchrl_etdmpc.training.config import config_from_dict
@@ -130,6 +131,7 @@ def test_a_command_names_settings_and_options_that_exist(command, own_module, mo
     runpy.run_path(str(path), run_name="__main__")  # prints the settings and does nothing else
     settings = yaml.safe_load(capsys.readouterr().out)
     kinds = {"evaluate.py": EvaluateConfig, "export.py": ExportConfig, "distributed.py": DistributedConfig}
+    kinds |= {"study.py": StudyConfig}
     config_from_dict(kinds.get(path.name, TrainConfig), settings)
 
 

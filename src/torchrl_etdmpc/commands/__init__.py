@@ -18,6 +18,7 @@ _COMMANDS = {
     "export": "writes an agent as programs that need PyTorch only",
     "report": "compares runs with each other and with published baselines",
     "suite": "trains every run of an experiment: tasks x seeds x variants",
+    "study": "measures what a trained planner believes, and what is true of it",
 }
 
 
@@ -29,7 +30,7 @@ def main(command: str | None = None) -> None:
 
     Args:
         command (str, optional): ``"train"``, ``"train_dmc"``, ``"distributed"``, ``"evaluate"``, ``"export"``,
-            ``"report"`` or ``"suite"``. Default: the first argument.
+            ``"report"``, ``"suite"`` or ``"study"``. Default: the first argument.
     """
     if command is None:
         command = _first_argument()

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -63,8 +63,12 @@ class EvaluateConfig:
             raise ValueError(f"video must end in .mp4 or .gif, got {self.video!r}.")
 
 
-def task_of(config: EvaluateConfig) -> Task:
-    """The task that the command names, or the one that the agent was trained on, with what its run changed about it."""
+def task_of(config: Any) -> Task:
+    """The task that the command names, or the one that the agent was trained on, with what its run changed about it.
+
+    Args:
+        config (EvaluateConfig): or any other with its ``checkpoint``, ``task`` and changes to the task.
+    """
     changes = {name: getattr(config, name) for name in ("action_repeat", "episode_length", "terminates")}
     told = {name: value for name, value in changes.items() if value is not None}
     stored = read_agent_file(config.checkpoint)["config"]

@@ -38,6 +38,8 @@ def test_the_planner_gains_what_the_best_actions_gain_over_a_policy_that_stands_
     assert result.policy.tolist() == pytest.approx(policy, rel=1e-4)
     assert result.planned.tolist() == pytest.approx(planned, abs=0.1)
     assert (result.difference > 0.5).all()
+    sorted_ones = advantage.figure(result).axes[1].lines[0].get_ydata()
+    assert sorted_ones.tolist() == sorted(result.difference.tolist())
 
 
 def test_nothing_is_gained_over_an_optimal_policy(measure):

@@ -43,6 +43,7 @@ def test_first_decisions_are_left_out_and_states_without_plans_refused(world, ma
     result = consistency.consistency(planner, states)
     assert len(result.episode) == 3 * 3
     assert len(consistency.table(result)) == 2 + 2 + 3
+    assert [len(line.lines[0].get_xdata()) for line in consistency.figure(result).axes[0].containers] == [2, 2, 3]
     for none in (states._replace(plan_mean=None), states._replace(step=torch.zeros_like(states.step))):
         with pytest.raises(ValueError, match="states must have plans before them, got none; play the episodes with"):
             consistency.consistency(planner, none)

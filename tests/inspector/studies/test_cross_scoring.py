@@ -46,3 +46,5 @@ def test_the_table_has_an_interval_around_every_gain():
     found = next(row for row in rows if (row["found_by"], row["scored_by"]) == ("ensemble", "simulator"))
     assert found["gain"] == pytest.approx(100 * (returns[:, 1, 2] - returns[:, 2, 2]).mean().item(), rel=1e-4)
     assert all(row["low"] < row["gain"] < row["high"] for row in rows)
+    bars = [bar.get_height() for bar in cross_scoring.figure(result).axes[0].patches]
+    assert sorted(bars) == pytest.approx(sorted(row["gain"] for row in rows))

@@ -19,6 +19,7 @@ def test_heads_drift_apart_step_by_step_and_their_mean_stays_true(make_episodes,
     expected = DRIFT * torch.arange(1.0, 5)
     assert torch.allclose(result.spread, expected.expand(5, 2, -1), atol=1e-5)
     assert torch.allclose(result.error, torch.zeros(5, 2, 4), atol=1e-5)
+    assert torch.allclose(result.deviation, result.returns.flatten(-2).std(-1) / 2)
     # Each head sees minus the squared distance from where it thinks it is: the mean misses the drift's square.
     value = -(result.true[:, :, 1:, 0] - world.goal).square()
     assert torch.allclose(result.returns.mean((-2, -1))[..., 0] + 2 * DRIFT**2, 1.99 * value[..., 0], atol=0.01)
@@ -40,4 +41,7 @@ def test_pessimism_keeps_the_heads_together(make_episodes, make_planner, WorldSi
     assert (result.spread[:, 1, -1] < 0.7 * result.spread[:, 0, -1]).all()
     assert (result.true_returns[:, 1, -1] < result.true_returns[:, 0, -1]).all()  # and costs return
     assert len(latent_gallery.table(result)) == 2 * 3
-    assert "beta 10 over beta 0: 0." in latent_gallery.lines(result)[0]
+    axes = latent_gallery.figure(result).axes
+    assert len(axes) == 2 * latent_gallery.SHOWN
+    assert [len(axis.lines) for axis in axes[: latent_gallery.SHOWN]] == [2 * (2 + 1 + 1) + 1] * latent_gallery.SHOWN
+    assert "beta 10 over beta 0, geometric mean: 0." in latent_gallery.lines(result)[0]

@@ -52,3 +52,6 @@ def test_the_study_reports_gap_agreement_and_time_of_a_planner_s_candidates(make
     slower = [row["times_the_closed_form"] for row in rows if row["iterations"] == 200]
     assert min(slower) > 2
     assert len(solver.lines(result)) == 4
+    axes = solver.figure(result).axes
+    assert [len(axis.lines) for axis in axes] == [3, 3]
+    assert axes[0].lines[0].get_ydata().tolist() == result.gap[0, 0].tolist()

@@ -40,6 +40,8 @@ def test_the_lines_say_bias_and_scale():
     rows = value_bias.table(result)
     assert [row["bias"] for row in rows] == [1, -2]
     assert [row["correlation"] for row in rows] == pytest.approx([1, 1])
+    points = value_bias.figure(result).axes[1].collections[0].get_offsets()
+    assert points.tolist() == [[step, 1] for step in range(12)]
     assert value_bias.lines(result)[0] == (
         "value: +1.00 [+1.00, +1.00] against the return that followed (5.5 +- 3.6), correlation 1.00"
     )

@@ -115,7 +115,10 @@ def lines(result: Advantage) -> list[str]:
 
 
 def figure(result: Advantage) -> Any:
-    """The difference over the first two principal components of the latents, and its distribution."""
+    """The difference over the first two principal components of the latents, and its distribution.
+
+    The right axis is linear up to the median of the differences' size and logarithmic beyond.
+    """
     from matplotlib.figure import Figure
 
     picture = Figure(figsize=(7.2, 3.1), layout="constrained")
@@ -129,10 +132,13 @@ def figure(result: Advantage) -> Any:
     left.set_ylabel(f"component 2 ({float(shares[1]):.0%})")
     picture.colorbar(points, ax=left, label="planner minus policy", extend="both")
     row = table(result)[0]
-    right.hist(result.difference, bins=30, color="#0072B2")
-    right.axvline(0, color="black", linewidth=0.8)
-    right.axvline(row["difference"], color="#D55E00")
-    right.axvspan(row["low"], row["high"], color="#D55E00", alpha=0.25, linewidth=0)
-    right.set_xlabel("planner minus policy; mean and interval")
-    right.set_ylabel("states")
+    shares = torch.arange(1, len(result.episode) + 1) / len(result.episode)
+    right.plot(shares, result.difference.sort().values, color="#0072B2")
+    right.axhline(0, color="black", linewidth=0.8)
+    right.axhline(row["difference"], color="#D55E00", label="mean, interval")
+    right.axhspan(row["low"], row["high"], color="#D55E00", alpha=0.25, linewidth=0)
+    right.set_yscale("symlog", linthresh=max(float(result.difference.abs().median()), 1e-3))
+    right.set_xlabel("share of the states")
+    right.set_ylabel("planner minus policy")
+    right.legend(frameon=False)
     return picture

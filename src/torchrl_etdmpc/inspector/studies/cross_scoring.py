@@ -131,7 +131,7 @@ def figure(result: CrossScores) -> Any:
     from matplotlib.figure import Figure
 
     rows = table(result)
-    picture = Figure(figsize=(5.2, 3.2), layout="constrained")
+    picture = Figure(figsize=(5.2, 3.4), layout="constrained")
     axis = picture.subplots()
     for column, (estimate, colour) in enumerate(zip(SCORED_BY, ("#0072B2", "#56B4E9", "#D55E00"), strict=True)):
         part = rows[column::3]
@@ -143,5 +143,5 @@ def figure(result: CrossScores) -> Any:
     axis.set_xticks(range(2), [f"planned with {name}" for name in FOUND_BY[:2]])
     axis.axhline(0, color="black", linewidth=0.8)
     axis.set_ylabel("gain over the policy, per episode")
-    axis.legend(frameon=False)
+    picture.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return picture

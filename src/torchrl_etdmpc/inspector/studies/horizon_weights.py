@@ -113,7 +113,7 @@ def figure(result: HorizonWeights) -> Any:
     axes = picture.subplots(2, count, squeeze=False, height_ratios=(1, 1.2), sharex="col", sharey="row")
     heats = []
     for column, beta in enumerate(result.betas):
-        shown = result.weights[:, column].mean(0)
+        shown = result.weights[:, column].mean(0).numpy()
         extent = (0.5, depths + 0.5, len(shown) + 0.5, 0.5)
         heats.append(axes[0, column].imshow(shown, aspect="auto", vmin=0, vmax=1, cmap="viridis", extent=extent))
         axes[0, column].set_title(f"beta {beta:g}", fontsize=10)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.functional import ensemble_variance
 from torchrl_etdmpc.inspector.studies.components import components
 from torchrl_etdmpc.inspector.studies.replan import (
     best_sequences,
@@ -46,6 +47,11 @@ class LatentGallery(NamedTuple):
         """Root mean squared distance of the heads from their mean, in latent space, ``[S, b, H]``."""
         heads = self.imagined[:, :, :, 1:]
         return (heads - heads.mean(2, keepdim=True)).square().sum(-1).mean(2).sqrt()
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviation of the mean return estimate (thesis Eq. 3.3), which ``beta`` weighs, ``[S, b, H]``."""
+        return ensemble_variance(self.returns).sqrt()
 
     @property
     def error(self) -> Tensor:
@@ -93,11 +99,12 @@ def latent_gallery(
 
 
 def table(result: LatentGallery) -> list[dict[str, Any]]:
-    """Spread of the heads, error of their mean, and estimated and true return, by ``beta`` and depth."""
+    """Spread of the heads, error of their mean, deviation and mean of the estimates, true return; by beta and depth."""
     rows = []
     columns = {
         "spread": result.spread,
         "error": result.error,
+        "deviation": result.deviation,
         "estimated_return": result.returns.mean((-2, -1)),
         "true_return": result.true_returns,
     }
@@ -114,16 +121,21 @@ def table(result: LatentGallery) -> list[dict[str, Any]]:
 def lines(result: LatentGallery) -> list[str]:
     """What came out: the last ``beta`` against the first, state by state."""
     first, last = result.betas[0], result.betas[-1]
-    ratio = episode_interval((result.spread[:, -1, -1] / result.spread[:, 0, -1]).log(), result.episode)
-    low, middle, high = (bound.exp().item() for bound in (ratio.low, ratio.value, ratio.high))
+    texts = []
+    for name, values in (("spread of the heads", result.spread), ("deviation of the returns", result.deviation)):
+        ratio = episode_interval((values[:, -1, -1] / values[:, 0, -1]).log(), result.episode)
+        low, middle, high = (bound.exp().item() for bound in (ratio.low, ratio.value, ratio.high))
+        texts.append(
+            f"{name} at the last depth, beta {last:g} over beta {first:g}, geometric mean: {middle:.2f} "
+            f"[{low:.2f}, {high:.2f}]"
+        )
     lost = result.true_returns[:, -1, -1] - result.true_returns[:, 0, -1]
     change = episode_interval(lost, result.episode)
-    return [
-        f"spread of the heads at the last depth, beta {last:g} over beta {first:g}: {middle:.2f} "
-        f"[{low:.2f}, {high:.2f}]",
-        f"true return over the horizon, beta {last:g} minus beta {first:g}: {change.value:+.3f} "
-        f"[{change.low:+.3f}, {change.high:+.3f}]",
-    ]
+    texts.append(
+        f"true return of the whole plan, beta {last:g} minus beta {first:g}: {change.value:+.3f} "
+        f"[{change.low:+.3f}, {change.high:+.3f}]"
+    )
+    return texts
 
 
 def figure(result: LatentGallery) -> Any:
@@ -132,7 +144,7 @@ def figure(result: LatentGallery) -> Any:
     from matplotlib.lines import Line2D
 
     count = min(SHOWN, len(result.episode))
-    picture = Figure(figsize=(2.6 * count + 0.6, 5.2), layout="constrained")
+    picture = Figure(figsize=(2.1 * count + 0.6, 4.4), layout="constrained")
     axes = picture.subplots(2, count, squeeze=False)
     colours = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
     depths = range(1, result.true_returns.shape[-1] + 1)

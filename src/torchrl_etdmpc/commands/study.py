@@ -1,0 +1,199 @@
+"""``study``: what a trained planner believes beside what is true, as a figure, a table and two or three lines."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib
+import importlib.util
+import io
+import json
+import platform
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+
+from torchrl_etdmpc.commands.command_line import hydra_main
+from torchrl_etdmpc.commands.evaluate import task_of
+from torchrl_etdmpc.commands.train import CONFIG
+from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
+from torchrl_etdmpc.inspector.studies import choose_states
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner
+from torchrl_etdmpc.runs import library_versions, progress_bar, replacing
+from torchrl_etdmpc.runs.files import write_whole
+from torchrl_etdmpc.training import load_agent, resolve_device
+
+StudyName = Literal[
+    "all",
+    "cross_scoring",
+    "latent_gallery",
+    "horizon_weights",
+    "calibration",
+    "value_bias",
+    "consistency",
+    "advantage",
+    "solver",
+]
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """What to study."""
+
+    study: StudyName
+    """The study, also written without ``study=`` as the first argument; ``all`` makes every one."""
+    checkpoint: str
+    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
+    out: str = "studies"
+    """Folder for NAME.png, NAME.csv, NAME.npz and NAME.json."""
+    episodes: int = 10
+    """How many the planner plays; intervals are over episodes."""
+    states: int = 200
+    """How many are drawn from them."""
+    task: str | None = None
+    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
+    action_repeat: int | None = None
+    """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
+    episode_length: int | None = None
+    """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
+    terminates: bool | None = None
+    """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
+    score: str | None = None
+    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
+    reanalyze_score: str | None = None
+    """Likewise a ``reanalyze.score``."""
+    extra_terms: str | None = None
+    """Likewise ``loss.extra_terms``."""
+    seed: int = 0
+    """Of the episodes, the choice of states and the plans."""
+    device: str = "auto"
+    """``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "states"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0 <= self.seed < 2**32 - self.episodes:
+            raise ValueError(f"seed must be in [0, 2**32 - episodes), got {self.seed}.")
+
+
+def main() -> None:
+    """The command; the name of the study may stand alone."""
+    if len(sys.argv) > 1 and re.fullmatch(r"(?!help$)\w+", sys.argv[1]):
+        sys.argv[1] = f"study={sys.argv[1]}"
+    _main()
+
+
+@hydra_main(CONFIG, "study", StudyConfig)
+def _main(config: StudyConfig) -> None:
+    """Measures what a trained planner believes, and what is true of it."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ImportError("this command needs matplotlib; run: pip install matplotlib")
+    task, device = task_of(config), resolve_device(config.device)
+    env = make_env(task, seed=config.seed)
+    agent, _, counters = load_agent(
+        config.checkpoint,
+        observation_dim=env.observation_spec["observation"].shape[-1],
+        action_dim=env.action_spec.shape[-1],
+        device=device,
+        compile_setting="off",
+    )
+    env.close(raise_if_closed=False)
+    folder = Path(config.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    episodes: list[Episode] = []
+    with progress_bar("playing", config.episodes, "episodes", passing=True) as bar:
+        for number in range(config.episodes):
+            episodes.append(play_episode(agent.eval_planner, task, seed=config.seed + number))
+            bar.update(number + 1)
+    returns = torch.stack([episode.reward.sum() for episode in episodes])
+    about = {
+        "task": task.name,
+        "checkpoint": config.checkpoint,
+        "checkpoint_sha256": hashlib.sha256(Path(config.checkpoint).expanduser().read_bytes()).hexdigest(),
+        "trained_env_steps": counters["env_steps"],
+        "episodes": config.episodes,
+        "mean_return": returns.mean().item(),
+        "states_asked": config.states,
+        "seed": config.seed,
+        "device": str(device),
+        "processor": _processor(),
+        "threads": torch.get_num_threads(),
+        "versions": library_versions(),
+    }
+    print(
+        f"{task.name}, trained for {counters['env_steps']} env steps: {config.episodes} episodes, "
+        f"return {returns.mean():.1f}"
+    )
+    simulator = Simulator(task)
+    names = [name for name in get_args(StudyName) if name != "all"] if config.study == "all" else [config.study]
+    for name in names:
+        module = importlib.import_module(f"torchrl_etdmpc.inspector.studies.{name}")
+        result = _study(module, name, agent.eval_planner, episodes, simulator, config)
+        lines = module.lines(result)
+        _write(folder, name, module, result, {**about, "study": name, "lines": lines})
+        print("\n".join([f"{name}: {folder / name}.png", *(f"  {line}" for line in lines)]))
+
+
+def _study(
+    module: ModuleType,
+    name: str,
+    planner: EnsembleMPPIPlanner,
+    episodes: Sequence[Episode],
+    simulator: Simulator,
+    config: StudyConfig,
+) -> Any:
+    """The study's result, from states that have as many decisions after them as it looks ahead."""
+    decisions = simulator.task.decision_steps_per_episode
+    window = min(50, decisions // 2)
+    ahead = {
+        "cross_scoring": 3,
+        "latent_gallery": planner.horizon,
+        "calibration": 6,
+        "value_bias": decisions // 2,  # so that what the time limit cut off weighs little
+        "advantage": window,
+    }
+    states = choose_states(episodes, config.states, ahead=ahead.get(name, 1), seed=config.seed)
+    study = getattr(module, name)
+    if name == "value_bias":
+        return study(planner, episodes, states, seed=config.seed)
+    if name in ("horizon_weights", "consistency", "solver"):
+        return study(planner, states, seed=config.seed)
+    options = {"cross_scoring": {"decisions": decisions}, "advantage": {"steps": min(10, window), "horizon": window}}
+    return study(planner, states, simulator, seed=config.seed, **options.get(name, {}))
+
+
+def _write(folder: Path, name: str, module: ModuleType, result: Any, about: dict[str, Any]) -> None:
+    """The figure, the table, the arrays, and what they were made from."""
+    picture = module.figure(result)
+    with replacing(folder / f"{name}.png") as partial:
+        picture.savefig(partial, dpi=100, metadata={"Software": None})
+    rows = [{key: _short(value) for key, value in row.items()} for row in module.table(result)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(folder / f"{name}.csv", text.getvalue())
+    with replacing(folder / f"{name}.npz") as partial:
+        arrays: dict[str, Any] = {key: np.asarray(value) for key, value in result._asdict().items()}
+        np.savez_compressed(partial, **arrays)
+    write_whole(folder / f"{name}.json", json.dumps(about, indent=2) + "\n")
+
+
+def _short(value: Any) -> Any:
+    return f"{value:.5g}" if isinstance(value, float) else value
+
+
+def _processor() -> str:
+    """The CPU's name where the system tells it."""
+    file = Path("/proc/cpuinfo")
+    names = re.findall(r"^model name\s*: (.+)$", file.read_text(), re.M) if file.exists() else []
+    return f"{platform.machine()} ({names[0]})" if names else platform.machine()

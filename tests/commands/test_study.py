@@ -1,0 +1,159 @@
+"""The command: files, lines, and mistakes in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+
+from torchrl_etdmpc import commands  # noqa: E402
+from torchrl_etdmpc.commands.study import StudyName  # noqa: E402
+from torchrl_etdmpc.inspector import Simulator, play_episode  # noqa: E402
+from torchrl_etdmpc.inspector.studies import advantage, choose_states  # noqa: E402
+from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, save_agent  # noqa: E402
+
+NAMES = [name for name in get_args(StudyName) if name != "all"]
+FEW = ("episodes=2", "states=6", "device=cpu", "seed=4")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> Path:
+    """An untrained agent of small networks, whose episodes have 30 decisions."""
+    config = TrainConfig.from_dict(
+        {
+            "task": "cartpole-balance",
+            "episode_length": 60,
+            "compile": "off",
+            "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+            "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+            "reanalyze": {"num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+        }
+    )
+    torch.manual_seed(0)
+    agent = build_agent(config, observation_dim=5, action_dim=1)
+    return save_agent(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 400})
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch, capfd):
+    """Runs the command in this process, in an empty directory; returns its exit message, stdout and stderr."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the command; this restores it
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> tuple[object, str, str]:
+        monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", "study", *arguments])
+        message = None
+        try:
+            commands.main()
+        except SystemExit as stop:
+            message = stop.code
+        return message, *capfd.readouterr()
+
+    return run
+
+
+def rows(file: Path) -> list[dict[str, str]]:
+    with open(file, newline="", encoding="utf-8") as text:
+        return list(csv.DictReader(text))
+
+
+def made(folder: Path, name: str) -> None:
+    """All four files of a study, and what they hold."""
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    about = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    assert (about["study"], about["task"], about["seed"]) == (name, "cartpole-balance", 4)
+    assert len(about["checkpoint_sha256"]) == 64
+    assert about["versions"]["torch"]
+    assert len(about["lines"]) >= 1
+    assert rows(folder / f"{name}.csv")
+    assert np.load(folder / f"{name}.npz", allow_pickle=False).files
+
+
+def test_a_study_is_what_its_function_returns_and_follows_from_the_seed(tmp_path, checkpoint, study):
+    message, out, err = study("advantage", f"checkpoint={checkpoint}", "out=here", *FEW)
+    assert (message, err) == (None, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
+    assert sorted(path.suffix for path in (tmp_path / "here").iterdir()) == [".csv", ".json", ".npz", ".png"]
+    made(tmp_path / "here", "advantage")
+    agent, config, _ = load_agent(checkpoint)
+    planner = agent.eval_planner
+    episodes = [play_episode(planner, config.task_spec, seed=seed) for seed in (4, 5)]
+    states = choose_states(episodes, 6, ahead=15, seed=4)
+    result = advantage.advantage(planner, states, Simulator(config.task_spec), steps=10, horizon=15, seed=4)
+    arrays = np.load(tmp_path / "here" / "advantage.npz")
+    assert np.array_equal(arrays["planned"], result.planned)
+    assert np.array_equal(arrays["latent"], result.latent)
+    lines = out.splitlines()
+    assert lines[0].startswith("cartpole-balance, trained for 400 env steps: 2 episodes, return ")
+    assert lines[1:] == ["advantage: here/advantage.png", *(f"  {line}" for line in advantage.lines(result))]
+
+
+def test_the_name_may_be_written_as_a_setting(tmp_path, checkpoint, study):
+    message, out, err = study("study=consistency", f"checkpoint={checkpoint}", *FEW)
+    assert (message, err) == (None, "")
+    made(tmp_path / "studies", "consistency")
+    assert "consistency: studies/consistency.png" in out
+
+
+@pytest.mark.slow  # the gradients alone take seconds
+def test_all_makes_every_study(tmp_path, checkpoint, study):
+    message, out, err = study("all", f"checkpoint={checkpoint}", *FEW)
+    assert (message, err) == (None, "")
+    for name in NAMES:
+        made(tmp_path / "studies", name)
+    assert [line.split(":")[0] for line in out.splitlines()[1:] if not line.startswith(" ")] == NAMES
+
+
+def test_every_study_has_a_function_of_its_name_and_the_three_others():
+    import importlib
+
+    for name in NAMES:
+        module = importlib.import_module(f"torchrl_etdmpc.inspector.studies.{name}")
+        assert all(callable(getattr(module, part)) for part in (name, "table", "lines", "figure"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (("cross", "checkpoint=a.pt"), "error: study must be one of all, cross_scoring, "),
+        (("checkpoint=a.pt",), "error: study=... is missing: the study, also written without"),
+        (("all",), "error: checkpoint=... is missing: an agent file"),
+        (("all", "checkpoint=a.pt"), "error: a.pt is not a file; pass a checkpoint such as "),
+        (("all", "checkpoint=a.pt", "episodes=0"), "error: episodes must be at least 1, got 0."),
+        (("all", "checkpoint=a.pt", "states=0"), "error: states must be at least 1, got 0."),
+        (
+            ("all", "checkpoint=a.pt", "seed=4294967295"),
+            "error: seed must be in [0, 2**32 - episodes), got 4294967295.",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line(study, arguments, error):
+    message, out, err = study(*arguments)
+    assert str(message).startswith(error)
+    assert "\n" not in str(message)
+    assert (out, err) == ("", "")
+
+
+def test_an_agent_of_another_task_is_refused(checkpoint, study):
+    message, _, _ = study("all", f"checkpoint={checkpoint}", "task=walker-walk", *FEW)
+    assert "the environment has 24 and 6; use the task it was trained on (cartpole-balance)." in str(message)
+
+
+def test_episodes_that_are_too_short_are_refused(checkpoint, study):
+    message, _, _ = study("calibration", f"checkpoint={checkpoint}", "task.episode_length=8", *FEW)
+    assert str(message) == (
+        "error: states must be at least 1 and have 6 decisions after them, got states=6 and episodes of at most 4 "
+        "decisions; take longer episodes."
+    )
