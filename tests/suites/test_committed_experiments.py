@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -225,3 +226,34 @@ def test_seeds_of_a_variant_train_with_the_same_settings():
     experiment = read_experiment(suite.EXPERIMENTS / "utd.yaml")
     first, second = (flat(experiment.config("bmpc", "humanoid-walk", seed).to_dict()) for seed in (1, 2))
     assert {name for name in first if first[name] != second[name]} == {"seed"}
+
+
+STUDIES = Path(__file__).parents[2] / "benchmarks" / "experiments"
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in STUDIES.glob("*.yaml")))
+def test_every_run_of_a_study_has_settings_that_can_be_trained(name, tmp_path):
+    experiment = read_experiment(STUDIES / f"{name}.yaml")
+    runs = experiment.runs(tmp_path)
+    assert len(runs) == len(experiment.tasks) * len(experiment.seeds) * len(experiment.variants)
+    assert {run.config.total_env_steps for run in runs} == {experiment.budget}
+
+
+def test_the_study_of_adaptive_horizons_varies_the_score_and_beta_alone():
+    experiment = read_experiment(STUDIES / "adaptive.yaml")
+    assert (len(experiment.tasks), len(experiment.seeds), experiment.budget) == (4, 5, 50_000)
+    configs = {name: flat(experiment.config(name, "walker-run", 1).to_dict()) for name in experiment.variants}
+    preset = configs["mean"]
+    assert (preset["preset"], preset["planner.score"], preset["planner.beta"]) == ("cpu", "mean", 0.0)
+    varied = {
+        name: {key: value for key, value in settings.items() if value != preset[key]}
+        for name, settings in configs.items()
+    }
+    assert varied == {
+        "mean": {},
+        "final": {"planner.score": "final"},
+        "adaptive beta 0": {"planner.score": "adaptive"},
+        "adaptive beta 1": {"planner.score": "adaptive", "planner.beta": 1.0},
+        "adaptive beta 3": {"planner.score": "adaptive", "planner.beta": 3.0},
+        "adaptive beta 10": {"planner.score": "adaptive", "planner.beta": 10.0},
+    }
