@@ -51,6 +51,12 @@ def test_an_episode_has_a_state_before_and_after_every_decision(walk):
     assert (walk.task, walk.seed, walk.terminated) == ("walker-walk", 3, False)
 
 
+def test_the_states_of_an_episode_share_its_actions(walk):
+    actions = [state["_extra_state"]["actions"] for state in walk.states]
+    assert [len(part) for part in actions] == list(range(13))
+    assert len({part.untyped_storage().data_ptr() for part in actions}) == 1
+
+
 def test_an_episode_follows_from_its_seed_and_leaves_the_callers_random_numbers(walk):
     planner = small_planner("walker-walk")
     before = torch.random.get_rng_state()

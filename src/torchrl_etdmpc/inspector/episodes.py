@@ -101,7 +101,7 @@ def play_episode(policy: TensorDictModuleBase, task: str | Task, *, seed: int, s
         action=whole["action"],
         reward=whole["next", "reward"].squeeze(-1),
         plan_mean=carried,
-        states=states,
+        states=_sharing_actions(states),
         terminated=bool(whole["next", "terminated"][-1]),
         task=spec.name,
         seed=seed,
@@ -237,6 +237,18 @@ def _not_exact(task: str) -> str:
         f"state cannot be restored exactly on task {task!r}: repeating its episode led elsewhere; "
         "use the task's settings and the versions of its simulator with which it was played."
     )
+
+
+def _sharing_actions(states: list[dict[str, Any] | None]) -> list[dict[str, Any] | None]:
+    """The same states, whose actions so far are the beginnings of one tensor: T of them instead of T squared."""
+    records = [None if state is None else state.get("_extra_state") for state in states]
+    actions = records[-1].get("actions") if isinstance(records[-1], dict) else None
+    if actions is None:
+        return states
+    for record in records:
+        if isinstance(record, dict) and torch.equal(record["actions"], actions[: len(record["actions"])]):
+            record["actions"] = actions[: len(record["actions"])]
+    return states
 
 
 def _device(policy: nn.Module) -> torch.device:
