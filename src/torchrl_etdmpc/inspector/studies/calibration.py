@@ -76,13 +76,13 @@ def rank_correlation(pairs: Tensor) -> Tensor:
     >>> rank_correlation(torch.tensor([[1.0, 10.0], [2.0, 30.0], [3.0, 20.0]])).item()
     0.5
     """
-    smaller = (pairs.unsqueeze(0) < pairs.unsqueeze(1)).double().sum(1)
-    equal = (pairs.unsqueeze(0) == pairs.unsqueeze(1)).double().sum(1)
-    ranks = smaller + equal / 2  # ties share their middle
-    ranks = ranks - ranks.mean(0)
-    one, other = ranks.unbind(-1)
-    norm = (one.square().sum(0) * other.square().sum(0)).sqrt()
-    return torch.where(norm > 0, (one * other).sum(0) / norm.clamp_min(1e-12), torch.zeros_like(norm))
+    rows = pairs.movedim(0, -1).contiguous()
+    ordered = rows.sort(-1).values
+    ranks = torch.searchsorted(ordered, rows) + torch.searchsorted(ordered, rows, right=True)  # ties share their middle
+    ranks = ranks.double() - ranks.double().mean(-1, keepdim=True)
+    one, other = ranks.unbind(-2)
+    norm = (one.square().sum(-1) * other.square().sum(-1)).sqrt()
+    return torch.where(norm > 0, (one * other).sum(-1) / norm.clamp_min(1e-12), torch.zeros_like(norm))
 
 
 def table(result: Calibration) -> list[dict[str, Any]]:
