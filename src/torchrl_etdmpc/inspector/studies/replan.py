@@ -104,9 +104,10 @@ def policy_sequences(planner: EnsembleMPPIPlanner, observation: Tensor, horizon:
     """The policy's mean actions along the average of the heads' predictions, ``[S, H, A]``."""
     model: Any = planner.world_model
     latent, actions = model.encode(observation.to(planner.env.device_and_dtype()[0])), []
-    for _ in range(horizon):
+    for step in range(horizon):
+        if step:
+            latent = model.next(latent.unsqueeze(0), actions[-1]).mean(0)
         actions.append(model.policy(latent)[0])
-        latent = model.next(latent.unsqueeze(0), actions[-1]).mean(0)
     return torch.stack(actions, dim=1).cpu()
 
 
