@@ -117,7 +117,7 @@ def lines(result: Advantage) -> list[str]:
 def figure(result: Advantage) -> Any:
     """The difference over the first two principal components of the latents, and its distribution.
 
-    The right axis is linear up to the median of the differences' size and logarithmic beyond.
+    The right axis is linear for the smaller three quarters of the differences and logarithmic beyond.
     """
     from matplotlib.figure import Figure
 
@@ -137,8 +137,7 @@ def figure(result: Advantage) -> Any:
     right.axhline(0, color="black", linewidth=0.8)
     right.axhline(row["difference"], color="#D55E00", label="mean, interval")
     right.axhspan(row["low"], row["high"], color="#D55E00", alpha=0.25, linewidth=0)
-    right.set_yscale("symlog", linthresh=max(float(result.difference.abs().median()), 1e-3))
+    right.set_yscale("symlog", linthresh=max(float(result.difference.abs().quantile(0.75)), 1e-3))
     right.set_xlabel("share of the states")
-    right.set_ylabel("planner minus policy")
     right.legend(frameon=False)
     return picture
