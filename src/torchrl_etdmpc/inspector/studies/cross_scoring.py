@@ -95,7 +95,7 @@ def _all_heads(returns: Tensor) -> Tensor:
 
 
 def table(result: CrossScores) -> list[dict[str, Any]]:
-    """Mean gains with their intervals."""
+    """Mean gains with their intervals; the median beside them, as a few states can make the mean."""
     interval = episode_interval(result.gain, result.episode)
     error = result.gain.std(0) / len(result.gain) ** 0.5
     return [
@@ -105,6 +105,7 @@ def table(result: CrossScores) -> list[dict[str, Any]]:
             "gain": interval.value[row, column].item(),
             "low": interval.low[row, column].item(),
             "high": interval.high[row, column].item(),
+            "median": result.gain[:, row, column].median().item(),
             "standard_error_over_states": error[row, column].item(),
             "states": len(result.gain),
         }

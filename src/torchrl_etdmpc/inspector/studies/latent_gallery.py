@@ -144,7 +144,7 @@ def figure(result: LatentGallery) -> Any:
     from matplotlib.lines import Line2D
 
     count = min(SHOWN, len(result.episode))
-    picture = Figure(figsize=(2.1 * count + 0.6, 4.4), layout="constrained")
+    picture = Figure(figsize=(1.9 * count + 0.6, 4.0), layout="constrained")
     axes = picture.subplots(2, count, squeeze=False)
     colours = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
     depths = range(1, result.true_returns.shape[-1] + 1)
