@@ -168,7 +168,7 @@ def figure(result: LatentGallery) -> Any:
         top.set_yticks([])
         bottom.set_xticks(list(depths))
         bottom.set_xlabel("depth")
-    axes[0, 0].set_ylabel("latent, two components")
+    axes[0, 0].set_ylabel("two components")
     axes[1, 0].set_ylabel("return estimate")
     named = zip(colours, result.betas, strict=False)
     legend = [Line2D([], [], color=colour, label=f"beta {beta:g}") for colour, beta in named]
