@@ -179,6 +179,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.num_proposals = num_proposals
         # Departure from BMPC, whose code adds them from large_action_dim dimensions on: above it, as the thesis says.
         self.iterations = iterations + (extra_iterations if self.world_model.action_dim > large_action_dim else 0)
+        self.extra_iterations = extra_iterations
+        self.large_action_dim = large_action_dim
         self.score = make_score(score, beta)
         self.discount = discount
         self.inverse_temperature = inverse_temperature
@@ -191,7 +193,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.proposal_log_std_bounds = _both_or_none(proposal_log_std_min, proposal_log_std_max)
         self.compiled_plan: Callable[..., Plan] | None = None
         vars(self)["_imagination"] = _Imagination(env.world_model)
-        self.observation_key = unravel_key(observation_key)
+        self.observation_key, self.action_key = unravel_key(observation_key), unravel_key(action_key)
         self.latent_key = None if latent_key is None else unravel_key(latent_key)
         self.is_init_key = unravel_key(is_init_key)
         self.plan_mean_key = unravel_key(plan_mean_key)
@@ -204,7 +206,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         written = [*self.plan_keys.values(), *([self.next_plan_mean_key] if warm_start else [])]
         # TorchRL's types know one key only.
         self.in_keys = [self.observation_key, *carried]  # pyright: ignore[reportAttributeAccessIssue]
-        self.out_keys = [unravel_key(action_key), *written]  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = [self.action_key, *written]  # pyright: ignore[reportAttributeAccessIssue]
         self._written = tuple(self.out_keys)
 
     @property
