@@ -51,14 +51,14 @@ _FLOORS = (
         "inspector": {"functional", "keys", "envs", "runs", "modules", "analysis", "planners", "training"},
     },
     {
-        "commands": {"analysis", "collectors", "envs", "inspector", "planners", "runs", "suites", "training"},
+        "commands": {"analysis", "checkpoints", "collectors", "envs", "inspector", "planners", "runs", "suites", "training"},
     },
 )
 _MAY_IMPORT = {name: allowed for floor in _FLOORS for name, allowed in floor.items()}
 _CORE = {"numpy", "tensordict", "torch", "torchrl"}
 _EXTRAS = (
     *("dm_control", "gymnasium", "hydra", "imageio_ffmpeg", "matplotlib", "mujoco", "pandas", "scipy", "tensorboard"),
-    *("tqdm", "wandb", "yaml"),
+    *("tqdm", "wandb", "yaml", "dash", "flask", "plotly", "werkzeug"),
 )
 
 
@@ -242,6 +242,7 @@ def test_the_pins_satisfy_the_declared_ranges_of_everything_that_the_commands_ne
         *extras["wandb"],
         *extras["ray"],
         *extras["sweep"],
+        *extras["inspect"],
     ]
     pins = _pins()
     for requirement in map(Requirement, declared):

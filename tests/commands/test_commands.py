@@ -38,7 +38,8 @@ def run_command(monkeypatch, capsys):
 
 def test_the_wheel_s_command_is_the_examples_code():
     assert PROJECT["project"]["scripts"] == {"torchrl-etdmpc": "torchrl_etdmpc.commands:main"}
-    for name in ("train", "train_dmc", "distributed", "evaluate", "export", "report", "suite", "study"):
+    names = ("train", "train_dmc", "distributed", "evaluate", "export", "report", "suite", "study", "inspect_planner")
+    for name in names:
         assert f'main("{name}")' in (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
 
 
@@ -61,7 +62,9 @@ def test_the_sdist_holds_the_checkout():
     assert tops - set(manifest) <= {"MANIFEST.in", "pyproject.toml"}  # these two are always there
 
 
-@pytest.mark.parametrize("name", ["train", "distributed", "evaluate", "export", "report", "study"])
+@pytest.mark.parametrize(
+    "name", ["train", "distributed", "evaluate", "export", "report", "study", "inspect_planner"]
+)
 def test_every_command_has_a_help_that_says_what_it_takes(run_command, name):
     message, out, err = run_command(name, "--help")
     assert message in (None, 0)
@@ -76,7 +79,7 @@ def test_without_a_command_the_commands_are_listed(run_command):
         assert message == (0 if arguments else 2)
         assert all(name in out for name in ("train", "distributed", "evaluate", "export", "report", "study"))
     assert run_command("--version") == (0, f"torchrl-etdmpc {__version__}\n", "")
-    known = "train, distributed, evaluate, export, report, suite, study"
+    known = "train, distributed, evaluate, export, report, suite, study, inspect_planner"
     assert run_command("tran")[0] == f"error: unknown command 'tran'; choose one of {known}."
 
 

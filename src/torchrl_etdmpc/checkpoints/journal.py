@@ -165,6 +165,24 @@ class ReplayJournal:
             buffer.writer.load_state_dict(state)
         self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
 
+    def read_row(self, files: Mapping[str, Any], row: int) -> TensorDictBase:
+        """One row, without its targets; of the files, the one that holds it is read.
+
+        Args:
+            files (mapping): what :meth:`save` returned.
+            row (int): from 0, the oldest that is still in the buffer.
+
+        Raises:
+            IndexError: if there is no such row.
+            DamagedFileError: if the file is missing or has changed.
+        """
+        count = min(files["written"], files["capacity"])
+        if not 0 <= row < count:
+            raise IndexError(f"row must be in [0, {count}), the rows of the saved buffer, got {row}.")
+        number = files["written"] - count + row
+        entry = next(entry for entry in files["rows"] if entry["begin"] <= number < entry["end"])
+        return cast(TensorDictBase, self._read(entry)[number - entry["begin"]])
+
     def salvage(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> list[str]:
         """Fills an empty buffer with the longest stretch of rows that can still be read, as if they were new.
 

@@ -18,6 +18,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
+from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_etdmpc.checkpoints.journal import ReplayJournal
@@ -202,6 +203,34 @@ class CheckpointStore:
 
     def _reason(self, faults: list[str]) -> str:
         return "; ".join(faults) or f"there is no checkpoint under {self.folder}"
+
+    def buffer_rows(self) -> int:
+        """How many rows the newest checkpoint's buffer holds; 0 without a checkpoint. Changes nothing.
+
+        Raises:
+            CheckpointError: if its manifest is damaged.
+        """
+        files = self._newest_buffer()
+        return 0 if files is None else min(files["written"], files["capacity"])
+
+    def read_row(self, row: int) -> TensorDictBase:
+        """A row of the newest checkpoint's buffer, see :meth:`ReplayJournal.read_row`. Changes nothing.
+
+        Raises:
+            CheckpointError: if there is no checkpoint, or it is damaged.
+            IndexError: if there is no such row.
+        """
+        files = self._newest_buffer()
+        if files is None:
+            raise CheckpointError(f"there is no checkpoint under {self.folder}, so no buffer to read.")
+        try:
+            return self.journal.read_row(files, row)
+        except DamagedFileError as error:
+            raise CheckpointError(str(error)) from error
+
+    def _newest_buffer(self) -> Mapping[str, Any] | None:
+        folders = sorted((self.folder / "resume").glob("[0-9]*"))
+        return _read_manifest(folders[-1])["replay"] if folders else None
 
     def exists(self) -> bool:
         """Whether there is something to go on from. Changes nothing: another process may be training here."""

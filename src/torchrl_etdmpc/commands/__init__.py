@@ -7,7 +7,9 @@ import os
 import signal
 import sys
 import threading
+from ctypes.util import find_library
 from types import FrameType
+from typing import NoReturn
 
 __all__ = ["main"]
 
@@ -19,7 +21,9 @@ _COMMANDS = {
     "report": "compares runs with each other and with published baselines",
     "suite": "trains every run of an experiment: tasks x seeds x variants",
     "study": "measures what a trained planner believes, and what is true of it",
+    "inspect_planner": "shows what an agent's planner sees, in the browser or saved as a page",
 }
+_renderer_is_a_guess = False
 
 
 def main(command: str | None = None) -> None:
@@ -30,7 +34,7 @@ def main(command: str | None = None) -> None:
 
     Args:
         command (str, optional): ``"train"``, ``"train_dmc"``, ``"distributed"``, ``"evaluate"``, ``"export"``,
-            ``"report"``, ``"suite"`` or ``"study"``. Default: the first argument.
+            ``"report"``, ``"suite"``, ``"study"`` or ``"inspect_planner"``. Default: the first argument.
     """
     if command is None:
         command = _first_argument()
@@ -42,6 +46,8 @@ def main(command: str | None = None) -> None:
     try:
         module = importlib.import_module(f"{__name__}.{command}")
     except Exception as error:  # MuJoCo's import fails in a dozen ways where a renderer is missing
+        if _renderer_is_a_guess:
+            begin_without_renderer()
         backend = os.environ["MUJOCO_GL"]
         if backend == "disable" or os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
             raise
@@ -54,7 +60,7 @@ def main(command: str | None = None) -> None:
 
 
 def _first_argument() -> str:
-    lines = "".join(f"  {name:11} {meaning}\n" for name, meaning in _COMMANDS.items())
+    lines = "".join(f"  {name:15} {meaning}\n" for name, meaning in _COMMANDS.items())
     usage = (
         f"usage: torchrl-etdmpc COMMAND ...\n\n{lines}\n"
         "torchrl-etdmpc COMMAND --help says what a command takes, torchrl-etdmpc --version which version this is."
@@ -74,9 +80,25 @@ def _first_argument() -> str:
     return given
 
 
+def begin_without_renderer() -> NoReturn:
+    """Begins this process anew without a renderer: MuJoCo cannot be imported a second time."""
+    os.environ["MUJOCO_GL"] = "disable"
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def renderer_is_a_guess() -> bool:
+    """Whether this process looked for a renderer by itself, so that it may do without one."""
+    return _renderer_is_a_guess
+
+
 def _choose_renderer(command: str, arguments: list[str]) -> None:
+    global _renderer_is_a_guess
     given = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
-    if command == "evaluate" and given.get("video", "null") != "null":
+    _renderer_is_a_guess = False
+    if command == "inspect_planner":
+        _renderer_is_a_guess = "MUJOCO_GL" not in os.environ and find_library("EGL") is not None
+        os.environ.setdefault("MUJOCO_GL", "egl" if _renderer_is_a_guess else "disable")
+    elif command == "evaluate" and given.get("video", "null") != "null":
         os.environ.setdefault("MUJOCO_GL", "egl")
     elif not any(":" in given.get(name, "") for name in ("task", "tasks", "code")):  # one's own task may render inside
         os.environ["MUJOCO_GL"] = "disable"  # whatever it was: without a film, a missing renderer need not hurt

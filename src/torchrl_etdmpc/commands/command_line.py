@@ -150,7 +150,7 @@ def _command() -> str:
 
 
 _FLAGS = {"--cfg", "-c", "--resolve", "--multirun", "-m"}
-_PATHS = {"run_dir", "checkpoint", "out", "video"}
+_PATHS = {"run_dir", "checkpoint", "out", "video", "save"}
 
 
 def _checked(arguments: list[str], config_class: type) -> list[str]:

@@ -20,6 +20,7 @@ __all__ = [
     "candidate_table",
     "compare_plans",
     "disagreement",
+    "empty",
     "latent_plane",
     "mixture_weights",
     "plan_and_policy",
@@ -62,7 +63,7 @@ def latent_plane(
     """
     points = trace.get("points")
     if points is None:
-        return _empty("this planner shows no latents")
+        return empty("this planner shows no latents")
     depth = trace.horizon if depth is None else depth
     first, second = (min(number, points.shape[-1] - 1) for number in components)
     heads, scores = points.shape[3], trace["scores"][iteration]
@@ -156,7 +157,11 @@ def score_spread(trace: Trace) -> go.Figure:
     elites = np.take_along_axis(scores, trace["elites"], 1)
     steps = np.arange(1, trace.iterations + 1)
     figure = _figure()
-    lines = [("best elite", elites[:, 0]), ("worst elite", elites[:, -1]), ("median candidate", np.nanmedian(scores, 1))]
+    lines = [
+        ("best elite", elites[:, 0]),
+        ("worst elite", elites[:, -1]),
+        ("median candidate", np.nanmedian(scores, 1)),
+    ]
     for number, (name, values) in enumerate(lines):
         figure.add_scatter(x=steps, y=values, name=name, mode="lines+markers", **_style(number))
     if trace.get("policy_scores") is not None:
@@ -191,6 +196,7 @@ def plan_gaussian(trace: Trace, iteration: int = -1) -> go.Figure:
             y=np.concatenate([high, low[::-1]]),
             fill="toself",
             fillcolor=_faint(style["line"]["color"]),
+            mode="lines",
             line={"width": 0},
             hoverinfo="skip",
             showlegend=False,
@@ -199,7 +205,7 @@ def plan_gaussian(trace: Trace, iteration: int = -1) -> go.Figure:
         figure.add_scatter(
             x=steps,
             y=mean[:, number],
-            name=f"action {number + 1}",
+            name=f"a{number + 1}",
             legendgroup=str(number),
             mode="lines+markers",
             customdata=std[:, number],
@@ -208,7 +214,7 @@ def plan_gaussian(trace: Trace, iteration: int = -1) -> go.Figure:
         )
     figure.update_xaxes(title_text="step", dtick=1)
     figure.update_yaxes(title_text="mean ± std")
-    return figure.update_layout(height=300)
+    return figure.update_layout(height=300, legend={"orientation": "v", "x": 1.02, "y": 1}, margin={"r": 60})
 
 
 def candidate_table(trace: Trace, iteration: int, candidate: int) -> np.ndarray | None:
@@ -224,9 +230,9 @@ def return_table(trace: Trace, iteration: int = -1, candidate: int | None = None
         table = candidate_table(trace, iteration, candidate)
         title = f"candidate {candidate}, score {trace['scores'][iteration, candidate]:.3f}"
     if table is None:
-        return _empty("this planner has no return table")
+        return empty("this planner has no return table")
     depths, heads, values = table.shape
-    names = [f"head {head + 1}" + (f", value {value + 1}" if values > 1 else "") for head in range(heads) for value in range(values)]
+    names = [f"{head + 1}.{value + 1}" for head in range(heads) for value in range(values)]
     rows = table.reshape(depths, -1)
     first = trace.horizon - depths + 1
     figure = _figure()
@@ -240,7 +246,7 @@ def return_table(trace: Trace, iteration: int = -1, candidate: int | None = None
         hovertemplate="depth %{y}, %{x}: %{z:.4f}<extra></extra>",
     )
     figure.update_yaxes(title_text="depth", autorange="reversed", type="category")
-    figure.update_xaxes(tickangle=-40)
+    figure.update_xaxes(title_text="dynamics head . value head", type="category")
     return figure.update_layout(height=max(280, 150 + 28 * depths), title={"text": title, "font": {"size": 13}})
 
 
@@ -251,7 +257,7 @@ def mixture_weights(trace: Trace, candidate: int | None = None) -> go.Figure:
     """
     weights = trace.get("mixture")
     if weights is None:
-        return _empty("depths have weights of their own with score=adaptive only")
+        return empty("depths have weights of their own with score=adaptive only")
     if candidate is None:
         rows = np.take_along_axis(weights, trace["elites"][..., None], 1).mean(1)
     else:
@@ -281,7 +287,7 @@ def plan_and_policy(trace: Trace) -> go.Figure:
     if trace.get("policy_action") is not None:
         bars.append(("policy", trace["policy_action"], ORANGE, "/"))
     for name, values, colour, pattern in bars:
-        marker = {"color": colour, "pattern": {"shape": pattern, "fgcolor": "white"}}
+        marker = {"color": colour, "pattern": {"shape": pattern, "fillmode": "replace"}}
         figure.add_bar(x=names, y=values, name=name, marker=marker)
     figure.update_yaxes(title_text="first action", range=[-1.05, 1.05])
     return figure.update_layout(height=300, barmode="group")
@@ -290,7 +296,7 @@ def plan_and_policy(trace: Trace) -> go.Figure:
 def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None) -> go.Figure:
     """How far apart the heads are by depth: standard deviation of the returns, and distance of the latents."""
     if trace.get("returns") is None and trace.get("latent_spread") is None:
-        return _empty("this planner has no heads")
+        return empty("this planner has no heads")
     figure = _figure(rows=1, cols=2, subplot_titles=["returns", "latents"], horizontal_spacing=0.14)
     elites = trace["elites"][iteration]
     tables, spreads = [], []
@@ -308,7 +314,9 @@ def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None
         spreads = [("elites", spread[elites].mean(0)), ("all candidates", spread.mean(0))]
         if candidate is not None:
             spreads.append(("clicked", spread[candidate]))
-    styles = {name: _style(number) for number, name in enumerate(("elites", "all candidates", "chosen", "policy", "clicked"))}
+    styles = {
+        name: _style(number) for number, name in enumerate(("elites", "all candidates", "chosen", "policy", "clicked"))
+    }
     shown: set[str] = set()
     for column, lines in enumerate((tables, spreads), 1):
         for name, values in lines:
@@ -319,13 +327,13 @@ def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None
     figure.update_xaxes(title_text="depth", dtick=1)
     figure.update_yaxes(title_text="std over heads", rangemode="tozero", col=1)
     figure.update_yaxes(title_text="distance from mean", rangemode="tozero", col=2)
-    return figure.update_layout(height=300, legend={"orientation": "h", "y": -0.3})
+    return figure.update_layout(height=300, legend={"orientation": "h", "y": -0.4}, margin={"b": 80})
 
 
 def reward_check(trace: Trace) -> go.Figure:
     """Rewards of the chosen sequence: by each head, and in the simulator."""
     if trace.get("chosen_rewards") is None:
-        return _empty("this planner says no rewards of its choice")
+        return empty("this planner says no rewards of its choice")
     rewards = trace["chosen_rewards"]
     steps = np.arange(1, len(rewards) + 1)
     figure = _figure()
@@ -419,7 +427,8 @@ def _figure(**subplots: Any) -> Any:
     return figure
 
 
-def _empty(text: str) -> Any:
+def empty(text: str) -> Any:
+    """A sentence in the place of a figure."""
     figure = _figure()
     figure.add_annotation(text=text, showarrow=False, x=0.5, y=0.5, xref="paper", yref="paper")
     figure.update_xaxes(visible=False)

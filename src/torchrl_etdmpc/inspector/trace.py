@@ -132,7 +132,9 @@ class Trace:
     def __post_init__(self) -> None:
         missing = sorted(REQUIRED.keys() - self.arrays.keys())
         if missing:
-            raise TraceError(f"a trace needs the array {missing[0]!r}, which is missing; it has {', '.join(self.arrays)}.")
+            raise TraceError(
+                f"a trace needs the array {missing[0]!r}, which is missing; it has {', '.join(self.arrays)}."
+            )
         sizes: dict[str, int] = {"C": min(COMPONENTS, self._size("centre", 0, COMPONENTS))}
         for name, array in self.arrays.items():
             if name not in _DIMENSIONS:
@@ -290,10 +292,9 @@ def trace_plan(
     latent = _start(model, observation, latent, device, dtype)
     carried = _warm_start(planner, plan_mean, latent)
     noise = planner.draw_noise(1, generator=torch.Generator(device).manual_seed(seed))
-    watched = planner
-    if progress is not None:
-        watched = with_settings(planner, score=_Watched(planner.score, planner.iterations, progress), beta=0.0)
-    plan = watched.plan(latent=latent[None], plan_mean=carried[None], explore=explore, noise=noise, trace=True)
+    steps = 2 * planner.iterations
+    told = planner if progress is None else watched(planner, lambda asked: progress(asked, steps))
+    plan = told.plan(latent=latent[None], plan_mean=carried[None], explore=explore, noise=noise, trace=True)
     assert plan.trace is not None
     search = PlanTrace(*(field[0] for field in plan.trace))
 
@@ -397,11 +398,16 @@ def principal_components(latents: Tensor) -> Components:
     return Components(centre.to(latents.dtype), basis.to(latents.dtype))
 
 
-class _Watched:
-    """A score that tells how often it was asked, once an iteration."""
+def watched(planner: EnsembleMPPIPlanner, tell: Callable[[int], None]) -> EnsembleMPPIPlanner:
+    """The same planner, which says after every iteration how many there have been; what ``tell`` raises ends a plan."""
+    return with_settings(planner, score=_Watched(planner.score, tell), beta=0.0)
 
-    def __init__(self, score: Score, iterations: int, progress: Callable[[int, int], None]) -> None:
-        self.score, self.iterations, self.progress, self.asked = score, iterations, progress, 0
+
+class _Watched:
+    """A score that tells how often it was asked: once an iteration."""
+
+    def __init__(self, score: Score, tell: Callable[[int], None]) -> None:
+        self.score, self.tell, self.asked = score, tell, 0
 
     @property
     def depths(self) -> Any:
@@ -410,7 +416,7 @@ class _Watched:
     def __call__(self, returns: Tensor) -> Tensor:
         scores = self.score(returns)
         self.asked += 1
-        self.progress(self.asked, 2 * self.iterations)
+        self.tell(self.asked)
         return scores
 
 
@@ -521,7 +527,9 @@ def _rolled(model: PredictionModel, latent: Tensor, actions: Tensor) -> Tensor:
     return torch.stack(latents)
 
 
-def latent_views(rolled: list[Tensor], start: Tensor, like: Trace | None = None) -> tuple[Components, dict[str, Tensor]]:
+def latent_views(
+    rolled: list[Tensor], start: Tensor, like: Trace | None = None
+) -> tuple[Components, dict[str, Tensor]]:
     """Latents of every iteration's candidates, ``[H, F, N, L]`` each, as the arrays of a trace that show them."""
     if like is None or like.get("basis") is None:
         components = principal_components(torch.cat([latents.flatten(0, 2) for latents in rolled]))

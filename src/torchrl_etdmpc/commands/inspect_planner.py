@@ -1,0 +1,152 @@
+"""``inspect_planner``: what the planner of a trained agent sees, on a page in the browser or saved as files."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
+from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
+from torchrl_etdmpc.commands.command_line import hydra_main
+from torchrl_etdmpc.commands.evaluate import EvaluateConfig, task_of
+from torchrl_etdmpc.commands.train import CONFIG
+from torchrl_etdmpc.envs import Task
+from torchrl_etdmpc.inspector.inspection import Inspection, State
+from torchrl_etdmpc.inspector.page import make_page, serve
+from torchrl_etdmpc.inspector.saved_page import plotly_script, write_page
+from torchrl_etdmpc.inspector.trace import checksum
+from torchrl_etdmpc.training import build_planner, load_agent, read_agent_file, resolve_device
+from torchrl_etdmpc.training.config import PlannerConfig
+
+
+@dataclass(frozen=True)
+class InspectConfig:
+    """What to look at."""
+
+    checkpoint: str
+    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
+    state: str = "random"
+    """EPISODE:STEP, an episode by its seed and a decision of it; replay:ROW of the buffer that is saved beside the
+    checkpoint; or random, a decision of the episode of this seed."""
+    save: str | None = None
+    """A folder: writes the page of the state and ends, without a server."""
+    play: Literal["planner", "bare"] = "planner"
+    """Who plays the episodes; bare is the policy network, for where planning takes long."""
+    steps: int | None = None
+    """Decisions of an episode, at most. Default: whole episodes."""
+    host: str = "127.0.0.1"
+    """Address that the page is served at; another machine's view of it needs allow_remote=true."""
+    port: int = 8050
+    """0 takes a free one."""
+    allow_remote: bool = False
+    """Whether anybody who reaches the page may use it."""
+    task: str | None = None
+    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
+    action_repeat: int | None = None
+    """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
+    episode_length: int | None = None
+    """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
+    terminates: bool | None = None
+    """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
+    score: str | None = None
+    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
+    reanalyze_score: str | None = None
+    """Likewise a ``reanalyze.score``."""
+    extra_terms: str | None = None
+    """Likewise ``loss.extra_terms``."""
+    seed: int = 0
+    """Of the random state and the planner's samples."""
+    device: str = "auto"
+    """``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"random|(\d{1,9}|replay):\d{1,9}", self.state):
+            raise ValueError(f"state must be EPISODE:STEP, replay:ROW or random, got {self.state!r}.")
+        if self.steps is not None and self.steps < 1:
+            raise ValueError(f"steps must be at least 1, got {self.steps}.")
+        if not 0 <= self.port < 2**16:
+            raise ValueError(f"port must be in [0, 65535], got {self.port}.")
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed must be in [0, 2**31 - 1], got {self.seed}.")
+
+
+def with_the_agent_s_planner(values: dict[str, Any], explicit: list[str]) -> dict[str, Any]:
+    """The command's settings, with those of the planner that it does not name as the agent was trained with them."""
+    stored = read_agent_file(values["checkpoint"])["config"]["planner"]
+    named: Mapping[str, Any] = values["planner"]
+    return {**values, "planner": stored | {name: named[name] for name in named if f"planner.{name}" in explicit}}
+
+
+@hydra_main(CONFIG, "inspect_planner", InspectConfig, complete=with_the_agent_s_planner)
+def main(config: InspectConfig) -> None:
+    """Shows what the planner of a trained agent sees: candidates, heads and depths of any state, on a local page."""
+    plotly_script()  # what is not installed is said before anything takes long
+    inspection = _inspection(config)
+    try:
+        state = _state(config, inspection)
+        if config.save is None:
+            app = make_page(inspection, state=state, allow_remote=config.allow_remote)
+            serve(app, host=config.host, port=config.port, allow_remote=config.allow_remote, ready=_say_where)
+        else:
+            trace = inspection.plan(state, {}, seed=config.seed)
+            strip = None if state.replay else inspection.strip(state.episode)
+            page = write_page(config.save, trace, strip=strip, step=state.step)
+            print(f"{inspection.task.name if inspection.task else 'agent'}: {page}, which any browser opens")
+    finally:
+        inspection.close()
+
+
+def _inspection(config: InspectConfig) -> Inspection:
+    device = resolve_device(config.device)
+    names = [field.name for field in dataclasses.fields(EvaluateConfig)]
+    task = task_of(EvaluateConfig(**{name: getattr(config, name) for name in names if hasattr(config, name)}))
+    _need_no_renderer(task)
+    agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off")
+    discount = agent.eval_planner.discount
+    planner = build_planner(agent.acting_model, config.planner, discount=discount, warm_start=True)
+    path = Path(config.checkpoint).expanduser()
+    about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
+    store = CheckpointStore(path.parent)
+    try:
+        rows = store.buffer_rows()
+    except CheckpointError:
+        rows = 0  # the agent file is what was asked for
+    return Inspection(
+        planner,
+        task,
+        bare=config.play == "bare",
+        steps=config.steps,
+        replay=(lambda row: store.read_row(row)["observation"]) if rows else None,
+        rows=rows,
+        about={"checkpoint": about},
+    )
+
+
+def _need_no_renderer(task: Task) -> None:
+    """Goes on without frames where MuJoCo's renderer, which nobody asked for, cannot be imported."""
+    if renderer_is_a_guess() and task.suite == "dm_control":
+        try:
+            importlib.import_module("dm_control.mujoco")
+        except Exception:  # every GL backend has its own error types
+            begin_without_renderer()
+
+
+def _state(config: InspectConfig, inspection: Inspection) -> State:
+    if config.state == "random":
+        length = config.steps or (inspection.task.decision_steps_per_episode if inspection.task else 1)
+        step = torch.randint(length, (), generator=torch.Generator().manual_seed(config.seed))
+        return State(episode=config.seed, step=int(step))
+    where, step = config.state.split(":")
+    return State(episode=0 if where == "replay" else int(where), step=int(step), replay=where == "replay")
+
+
+def _say_where(address: str, stop: Any) -> None:
+    print(f"{address} shows the planner; Ctrl-C ends it", flush=True)

@@ -1,0 +1,89 @@
+// A saved page: draws the figures in INSPECTION (data.js), and follows the scrubber and clicks. It asks for nothing.
+(function () {
+  "use strict";
+  var state = { iteration: INSPECTION.iterations - 1, candidate: null, side: 0 };
+  var config = { displayModeBar: false, responsive: true };
+
+  function numbers(packed) { // base64 of little-endian float32
+    var text = atob(packed), bytes = new Uint8Array(text.length);
+    for (var i = 0; i < text.length; i += 1) { bytes[i] = text.charCodeAt(i); }
+    return new Float32Array(bytes.buffer);
+  }
+
+  function figureOf(side, name) {
+    var made = INSPECTION.sides[side].figures[name];
+    return Array.isArray(made) ? made[Math.min(state.iteration, made.length - 1)] : made;
+  }
+
+  function copy(figure) { return JSON.parse(JSON.stringify(figure)); }
+
+  function draw(side, name) {
+    var div = document.getElementById(name + "-" + "ab"[side]);
+    var figure = copy(figureOf(side, name));
+    var clicked = state.candidate !== null && state.side === side;
+    if (name === "return_table" && clicked) { fill(figure, side); }
+    return Plotly.react(div, figure.data, figure.layout, config).then(function () {
+      if (name === "latent_plane" && clicked) { return ring(div); }
+      return div;
+    });
+  }
+
+  // The return table of a candidate: rows of depths, columns of dynamics and value heads.
+  function fill(figure, side) {
+    var packed = INSPECTION.sides[side].returns;
+    if (!packed) { return; }
+    packed.numbers = packed.numbers || numbers(packed.data);
+    var shape = packed.shape, columns = shape[3] * shape[4], rows = [];
+    var iteration = Math.min(state.iteration, shape[0] - 1);
+    var begin = (iteration * shape[1] + state.candidate) * shape[2] * columns;
+    for (var row = 0; row < shape[2]; row += 1) {
+      rows.push(Array.from(packed.numbers.subarray(begin + row * columns, begin + (row + 1) * columns)));
+    }
+    figure.data[0].z = rows;
+    var score = INSPECTION.sides[side].scores[iteration][state.candidate];
+    figure.layout.title = { text: "candidate " + state.candidate + ", score " + (score === null ? "not finite" : score.toFixed(3)), font: { size: 13 } };
+  }
+
+  function ring(div) {
+    var rings = [];
+    div._fullData.forEach(function (trace) {
+      var place = trace.customdata ? Array.from(trace.customdata).indexOf(state.candidate) : -1;
+      if (place >= 0) {
+        rings.push({
+          x: [trace.x[place]], y: [trace.y[place]], xaxis: trace.xaxis, yaxis: trace.yaxis, mode: "markers",
+          hoverinfo: "skip", showlegend: rings.length === 0, name: "clicked",
+          marker: { symbol: "circle-open", size: 18, color: "#CC79A7", line: { width: 3 } }
+        });
+      }
+    });
+    return Plotly.addTraces(div, rings);
+  }
+
+  function drawAll(names) {
+    INSPECTION.sides.forEach(function (made, side) {
+      (names || Object.keys(made.figures)).forEach(function (name) { draw(side, name); });
+    });
+    document.getElementById("iteration-value").textContent = (state.iteration + 1) + " of " + INSPECTION.iterations;
+  }
+
+  var scrubber = document.getElementById("iteration");
+  scrubber.addEventListener("input", function () {
+    state.iteration = Number(scrubber.value) - 1;
+    drawAll(INSPECTION.moving);
+  });
+  drawAll();
+  if (INSPECTION.difference) {
+    Plotly.react("difference", INSPECTION.difference.data, INSPECTION.difference.layout, config);
+  }
+  INSPECTION.sides.forEach(function (made, side) {
+    var div = document.getElementById("latent_plane-" + "ab"[side]);
+    div.on("plotly_click", function (event) {
+      var candidate = event.points[0].customdata;
+      if (candidate === undefined) { return; }
+      state.candidate = candidate;
+      state.side = side;
+      draw(side, "latent_plane");
+      draw(side, "return_table");
+    });
+  });
+})();
