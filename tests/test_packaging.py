@@ -51,7 +51,10 @@ _FLOORS = (
         "inspector": {"functional", "keys", "envs", "runs", "modules", "analysis", "planners", "training"},
     },
     {
-        "commands": {"analysis", "checkpoints", "collectors", "envs", "inspector", "planners", "runs", "suites", "training"},
+        "commands": {
+            *("analysis", "checkpoints", "collectors", "envs", "planners", "runs"),
+            *("inspector", "suites", "training"),
+        },
     },
 )
 _MAY_IMPORT = {name: allowed for floor in _FLOORS for name, allowed in floor.items()}

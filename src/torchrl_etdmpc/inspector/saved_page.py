@@ -22,6 +22,7 @@ __all__ = ["facts_of", "frames_of", "setting_rows", "write_page"]
 MOVING = ("latent_plane", "return_table", "disagreement", "plan_gaussian")  # with the iteration
 WIDE = ("latent_plane",)
 _HERE = Path(__file__).parent
+_POLICY = "default-src 'none'; script-src 'self' file:; style-src 'self' file: 'unsafe-inline'; img-src data:"
 
 
 def write_page(
@@ -209,7 +210,7 @@ def _html(sides: list[Trace], iterations: int, strip: Strip | None, step: int | 
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'self' file: 'unsafe-eval' 'unsafe-inline'; style-src 'self' file: 'unsafe-inline'; img-src data: blob:">
+<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
 <title>{title}</title>
 <link rel="icon" href="data:,">
 <link rel="stylesheet" href="inspector.css">
