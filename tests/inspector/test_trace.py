@@ -70,7 +70,8 @@ def test_what_does_not_come_from_the_search_is_what_the_planner_would_say():
     latent = model.encode(OBSERVATION)
     assert np.allclose(trace["policy_action"], model.policy(latent)[0].detach(), atol=1e-6)
     assert np.allclose(trace["policy_scores"], trace["policy_returns"].mean((1, 2, 3)), atol=1e-5)
-    assert np.array_equal(trace["policy_actions"][0, 0], trace["policy_actions"][2, 0])  # one policy, in one latent
+    for head in range(3):  # one policy, in one latent
+        np.testing.assert_allclose(trace["policy_actions"][head, 0], trace["policy_action"], atol=1e-6)
     # The chosen rewards and the values behind them are the return table: its first depth is r + gamma V.
     after = model.next(latent[None], torch.from_numpy(trace["chosen_actions"][0]))  # [F, L]
     first = trace["chosen_rewards"][0][:, None] + planner.discount * model.values(after).detach().numpy()
@@ -155,7 +156,8 @@ def test_when_no_score_is_finite_the_policy_is_chosen():
     trace = trace_plan(planner, OBSERVATION)
     assert trace.manifest["fallback"]
     assert int(trace["chosen"]) == -1
-    assert np.array_equal(trace["chosen_actions"][0], trace["policy_action"])
+    np.testing.assert_allclose(trace["chosen_actions"][0], trace["policy_action"], atol=1e-6)
+    assert np.array_equal(trace["action"], plan_of(planner, explore=False).action[0].numpy())
 
 
 def test_tracing_leaves_planner_and_random_state_alone():
@@ -323,7 +325,7 @@ def test_a_trace_is_saved_under_a_name_that_says_so(tmp_path):
 
 def test_a_trace_of_full_size_is_below_20_mb(tmp_path):
     """Of the largest action space of the benchmarks, 38 dimensions, with small networks: sizes do not depend on them."""
-    model = WorldModel(3, 38, latent_dim=512, mlp_dim=16, encoder_dim=16, num_dynamics=4)
+    model = WorldModel(3, 38, latent_dim=64, mlp_dim=16, encoder_dim=16, num_dynamics=4)
     planner = EnsembleMPPIPlanner(LatentEnv(model))  # the defaults are those of the full size: 512 candidates
     trace = trace_plan(planner, OBSERVATION)
     assert trace["actions"].shape == (8, 512, 6, 38)

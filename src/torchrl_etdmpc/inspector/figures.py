@@ -153,17 +153,18 @@ def _add_paths(
 
 def score_spread(trace: Trace) -> go.Figure:
     """Best, median and worst elite score and the median candidate's after every iteration, and the policy's own."""
-    scores = np.where(np.isfinite(trace["scores"]), trace["scores"], np.nan)
+    scores = np.where(np.isfinite(trace["scores"]), trace["scores"], -np.inf)
     elites = np.take_along_axis(scores, trace["elites"], 1)
     steps = np.arange(1, trace.iterations + 1)
     figure = _figure()
     lines = [
         ("best elite", elites[:, 0]),
         ("worst elite", elites[:, -1]),
-        ("median candidate", np.nanmedian(scores, 1)),
+        ("median candidate", np.median(scores, 1)),
     ]
     for number, (name, values) in enumerate(lines):
-        figure.add_scatter(x=steps, y=values, name=name, mode="lines+markers", **_style(number))
+        shown = np.where(np.isfinite(values), values, np.nan)
+        figure.add_scatter(x=steps, y=shown, name=name, mode="lines+markers", **_style(number))
     if trace.get("policy_scores") is not None:
         value = np.full(len(steps), trace["policy_scores"].mean())
         figure.add_scatter(x=steps, y=value, name="policy", mode="lines+markers", **_style(5))

@@ -41,7 +41,8 @@ _BASIS_ROWS = 8192  # latents that the principal components are fitted to, evenl
 _MOST_BYTES = 2**30  # of a trace in memory
 
 # The arrays of a trace and their dimensions, by the alphabet of the package; C principal components, S states along
-# the chosen sequence in the simulator, X and Y pixels. Those of the first group every trace has.
+# the chosen sequence in the simulator, X and Y pixels. An action-value critic searches with two of its value heads and
+# judges what was not searched with all: U and W. Those of the first group every trace has.
 REQUIRED = {
     "actions": "INHA",
     "scores": "IN",
@@ -68,13 +69,13 @@ OPTIONAL = {
     "start_point": "C",
     "points": "INHFC",
     "latent_spread": "INH",
-    "chosen_returns": "DFV",
+    "chosen_returns": "DFU",
     "chosen_points": "HFC",
     "chosen_rewards": "HF",
     "policy_action": "A",
     "policy_actions": "FHA",
     "policy_scores": "F",
-    "policy_returns": "FDGV",
+    "policy_returns": "FDGW",
     "real_rewards": "R",
     "real_points": "SC",
     "frames": "SXYB",

@@ -1,0 +1,314 @@
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.parse import urlsplit
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("dash")
+pytest.importorskip("gymnasium")
+
+from torchrl_etdmpc.envs import get_task  # noqa: E402
+from torchrl_etdmpc.inspector import load_trace, play_episode, trace_plan, with_settings  # noqa: E402
+from torchrl_etdmpc.inspector.inspection import Inspection, State  # noqa: E402
+from torchrl_etdmpc.inspector.page import make_page, page_settings, serve, slider_range  # noqa: E402
+from torchrl_etdmpc.inspector.settings import settings_of_class  # noqa: E402
+from torchrl_etdmpc.modules import WorldModel  # noqa: E402
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv  # noqa: E402
+
+TASK = get_task("gym/Pendulum-v1")
+BUDGET: dict[str, Any] = {"horizon": 3, "num_samples": 24, "num_elites": 5, "num_proposals": 3, "iterations": 3}
+
+
+class Greedy(EnsembleMPPIPlanner):
+    """A planner with an argument of its own."""
+
+    def __init__(self, env: LatentEnv, *, greed: float = 0.5, **kwargs: Any) -> None:
+        super().__init__(env, **kwargs)
+        self.greed = greed
+
+
+def make_planner() -> Greedy:
+    torch.manual_seed(0)
+    return Greedy(LatentEnv(WorldModel(3, 1, latent_dim=16, mlp_dim=16, num_dynamics=2)), greed=0.25, **BUDGET)
+
+
+class Served:
+    """A page in a thread of this process."""
+
+    def __init__(self, app: Any, **options: Any) -> None:
+        started = threading.Event()
+
+        def ready(address: str, stop: Callable[[], None]) -> None:
+            self.address, self.stop = address, stop
+            started.set()
+
+        self.thread = threading.Thread(target=serve, args=(app,), kwargs={"port": 0, "ready": ready, **options})
+        self.thread.start()
+        assert started.wait(30)
+
+    def close(self) -> None:
+        self.stop()
+        self.thread.join(30)
+        assert not self.thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def inspection() -> Iterator[Inspection]:
+    made = Inspection(make_planner(), TASK, steps=8, about={"checkpoint": {"name": "agent.pt"}})
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def served(inspection) -> Iterator[Served]:
+    page = Served(make_page(inspection))
+    yield page
+    page.close()
+
+
+def test_every_setting_has_a_control_also_a_new_one():
+    inspection = Inspection(make_planner())
+    text = json.dumps(make_page(inspection).layout.to_plotly_json(), default=lambda part: part.to_plotly_json())
+    for name in settings_of_class(Greedy):
+        assert f'{{"type": "setting", "name": "{name}"}}' in text, name
+    assert "greed" in page_settings(inspection)
+    inspection.close()
+
+
+@pytest.mark.parametrize("value", [0, 1, 3, 512])
+def test_a_whole_slider_holds_its_value(value):
+    low, high, step = slider_range(settings_of_class(Greedy)["horizon"], value)
+    assert low <= value <= high and step == 1
+
+
+@pytest.mark.parametrize("value", [-2.0, 0.0, 0.05, 0.99, 2.0, 30.0])
+def test_a_number_s_slider_holds_its_value(value):
+    low, high, _ = slider_range(settings_of_class(Greedy)["beta"], value)
+    assert low <= value <= high
+
+
+def test_the_page_answers_this_machine_only(served):
+    assert urlopen(served.address).status == 200
+    with pytest.raises(HTTPError, match="403") as caught:
+        urlopen(Request(served.address, headers={"Host": "evil.example:8050"}))
+    caught.value.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::"])
+def test_another_address_is_refused_unless_told(served, host):
+    with pytest.raises(ValueError, match=f"host must be this machine's own address, 127.0.0.1, got '{host}'.*allow_remote"):
+        serve(None, host=host)
+
+
+def test_a_port_in_use_is_one_line():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(OSError, match=f"port={port} cannot be used .*; choose another one, e.g. port={port + 1}"):
+            serve(None, port=port)
+
+
+def wait_for(condition: Callable[[], Any], what: str, seconds: float = 30) -> Any:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.05)
+    pytest.fail(f"the page did not show {what}")
+
+
+class Page:
+    """What the browser shows."""
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def traces(self, name: str, kind: str | None = None) -> list[dict[str, Any]]:
+        """Of a figure, the drawn traces with their numbers."""
+        script = """
+            const graph = document.getElementById(arguments[0]);
+            const drawn = graph.classList.contains('js-plotly-plot') ? graph : graph.querySelector('.js-plotly-plot');
+            const plain = values => values === undefined || values === null ? null : Array.from(values, value =>
+                value && value.length !== undefined && typeof value !== 'string' ? Array.from(value) : value);
+            return (drawn && drawn._fullData || []).map(trace => ({name: trace.name, x: plain(trace.x),
+                y: plain(trace.y), z: plain(trace.z), customdata: plain(trace.customdata),
+                colour: trace.marker ? plain(trace.marker.color.length ? trace.marker.color : null) : null}));
+        """
+        found = self.driver.execute_script(script, name)
+        return [trace for trace in found if kind is None or trace["name"] == kind]
+
+    def text(self, name: str) -> str:
+        return self.driver.find_element("id", name).text
+
+    def click(self, name: str) -> None:
+        self.driver.find_element("id", name).click()
+
+    def push(self, slider: str, key: str) -> None:
+        """A key on a slider's handle."""
+        self.driver.find_element("id", slider).find_element("css selector", "[role=slider]").send_keys(key)
+
+    def click_candidate(self, graph: str, number: int) -> None:
+        """The n-th drawn circle, with the mouse."""
+        from selenium.webdriver import ActionChains
+
+        (element,) = self.driver.find_elements("id", graph)
+        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
+        point = element.find_elements("css selector", ".scatterlayer .trace path.point")[number]
+        ActionChains(self.driver).move_to_element(point).pause(0.2).click().perform()
+
+    def require_clean(self) -> None:
+        """No error in the console and no request that left the loopback."""
+        from_console = [entry for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
+        assert from_console == []
+        for entry in self.driver.get_log("performance"):
+            message = json.loads(entry["message"])["message"]
+            if message["method"] == "Network.requestWillBeSent":
+                address = urlsplit(message["params"]["request"]["url"])
+                inside = address.scheme in ("data", "file", "blob", "chrome", "about")
+                assert inside or address.hostname == "127.0.0.1", address.geturl()
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch) -> Iterator[Page]:
+    selenium = pytest.importorskip("selenium.webdriver")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("needs chromium and chromedriver: apt-get install chromium chromium-driver")
+    from selenium.webdriver.chrome.service import Service
+
+    monkeypatch.chdir(tmp_path)
+    options = selenium.ChromeOptions()
+    options.binary_location = chromium
+    for option in (
+        *("headless=new", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-sync"),
+        *("disable-background-networking", "disable-component-update", "window-size=1280,1000"),
+        f"user-data-dir={tmp_path / 'browser'}",
+    ):
+        options.add_argument(f"--{option}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    started = selenium.Chrome(options=options, service=Service(driver))
+    yield Page(started)
+    started.quit()
+
+
+def expected(step: int, **changes: Any):
+    """The planner's own numbers, without the page."""
+    episode = play_episode(make_planner(), TASK, seed=0, steps=8)
+    planner = with_settings(make_planner(), **changes)
+    return trace_plan(planner, episode.observation[step], plan_mean=episode.plan_mean[step])
+
+
+def shows(page: Page, trace: Any, side: str, iteration: int) -> bool:
+    marks = [mark for mark in page.traces(f"latent_plane-{side}") if mark["name"] in ("candidate", "elite", "proposal")]
+    scores: dict[int, float] = {}
+    for mark in marks:
+        scores |= dict(zip(mark["customdata"] or [], mark["colour"] or [], strict=True))
+    shown = [scores.get(candidate, np.nan) for candidate in range(trace["scores"].shape[1])]
+    return len(scores) == len(shown) and np.allclose(shown, trace["scores"][iteration], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
+    """A state is chosen, a slider is moved, iterations are scrubbed, a candidate is clicked, two settings are compared
+    and the page is saved; then the saved page does what it can without a server."""
+    from selenium.webdriver.common.keys import Keys
+
+    page.driver.get(served.address)
+    first = expected(0)
+    wait_for(lambda: shows(page, first, "a", -1), "the plan of the first state")
+    assert "episode 0, step 0" in page.text("described-a")
+    assert f"{float(first['value']):.3f}" in page.text("described-a")
+
+    frames = wait_for(lambda: page.driver.find_elements("css selector", "#strip button"), "the filmstrip")
+    assert len(frames) == 8
+    frames[5].click()  # a state by its frame
+    chosen = expected(5)
+    wait_for(lambda: shows(page, chosen, "a", -1), "the plan of step 5")
+    page.push("step", Keys.ARROW_LEFT)
+    chosen = expected(4)
+    wait_for(lambda: shows(page, chosen, "a", -1), "the plan of step 4, by the keyboard")
+
+    page.push("iteration", Keys.ARROW_LEFT)
+    wait_for(lambda: shows(page, chosen, "a", 1), "the iteration before")
+    (line,) = page.traces("plan_gaussian-a", "a1")
+    np.testing.assert_allclose(line["y"], chosen["mean"][1, :, 0], atol=1e-6)
+
+    page.click_candidate("latent_plane-a", 2)
+    clicked = wait_for(lambda: page.traces("latent_plane-a", "clicked"), "the ring around the candidate")
+    circles = page.traces("latent_plane-a", "candidate")[0]
+    candidate = circles["customdata"][circles["x"].index(clicked[0]["x"][0])]
+    table = page.traces("return_table-a")[0]["z"]
+    np.testing.assert_allclose(table, chosen["returns"][1, candidate].reshape(3, -1), atol=1e-5)
+    page.click("unclick")
+    wait_for(lambda: not page.traces("latent_plane-a", "clicked"), "the chosen sequence again")
+
+    page.click("hold")
+    wait_for(lambda: shows(page, chosen, "b", -1), "the held setting beside it")
+    page.push('{"name":"horizon","type":"setting"}', Keys.ARROW_RIGHT)
+    longer = expected(4, horizon=4)
+    wait_for(lambda: shows(page, longer, "a", -1), "the plan with a longer horizon")
+    assert shows(page, chosen, "b", -1)
+    wait_for(lambda: "horizon 4 3" in page.text("differences"), "the differences")
+    gap = page.traces("difference")[0]["z"]
+    np.testing.assert_allclose(gap, chosen["mean"][-1] - longer["mean"][-1, :3], atol=1e-6)
+
+    page.push('{"name":"num_elites","type":"setting"}', Keys.END)  # 10 elites of 24 candidates can be
+    page.push('{"name":"num_samples","type":"setting"}', Keys.HOME)
+    wait_for(lambda: "num_elites must be at most num_samples=0" in page.text("error"), "why a setting cannot be")
+    page.click("reset")
+    wait_for(lambda: shows(page, chosen, "a", -1), "the settings it was trained with")
+
+    page.click("save")
+    wait_for(lambda: "saved" in page.text("saved"), "that it was saved")
+    assert np.array_equal(load_trace(tmp_path / "page" / "trace.npz")["scores"], chosen["scores"])
+    page.require_clean()
+
+    page.driver.get((tmp_path / "page" / "index.html").as_uri())
+    wait_for(lambda: shows(page, chosen, "a", -1), "the saved plan")
+    assert shows(page, chosen, "b", -1)
+    page.driver.find_element("id", "iteration").send_keys(Keys.ARROW_LEFT)
+    wait_for(lambda: shows(page, chosen, "a", 1), "an earlier iteration of the saved plan")
+    page.click_candidate("latent_plane-a", 4)
+    clicked = wait_for(lambda: page.traces("latent_plane-a", "clicked"), "the ring in the saved page")
+    circles = page.traces("latent_plane-a", "candidate")[0]
+    candidate = circles["customdata"][circles["x"].index(clicked[0]["x"][0])]
+    table = wait_for(lambda: page.traces("return_table-a")[0]["z"], "its return table")
+    np.testing.assert_allclose(table, chosen["returns"][1, candidate].reshape(3, -1), atol=1e-5)
+    page.require_clean()
+
+
+@pytest.mark.slow
+def test_the_theme_is_the_system_s_until_it_is_toggled(page, served):
+    def paper() -> str:
+        return page.driver.execute_script("return getComputedStyle(document.body).backgroundColor")
+
+    for scheme, colour, other in (("light", "rgb(255, 255, 255)", "rgb(20, 23, 27)"), ("dark", "rgb(20, 23, 27)", "rgb(255, 255, 255)")):
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+        page.driver.get(served.address)
+        wait_for(lambda: page.driver.find_elements("id", "theme"), "the page")
+        page.driver.execute_script("localStorage.clear(); document.documentElement.removeAttribute('data-theme')")
+        assert paper() == colour
+        page.click("theme")
+        assert paper() == other
+
+
+def test_a_state_to_begin_with_is_planned_first(inspection):
+    app = make_page(inspection, state=State(episode=3, step=2), folder=Path("elsewhere"))
+    text = json.dumps(app.layout.to_plotly_json(), default=lambda part: part.to_plotly_json())
+    assert '"id": "folder"' in text and '"value": "elsewhere"' in text
+    assert '"value": 3' in text
