@@ -496,3 +496,27 @@ def test_a_part_that_does_not_fit_is_named(store):
     other = Work()
     with pytest.raises(CheckpointError, match=r"/000000000001/layer\.pt does not fit this run: Error\(s\) in loading"):
         store.load({"layer": nn.Linear(3, 3)}, other.buffer)
+
+
+def test_single_rows_are_read_from_the_file_that_holds_them(tmp_path, monkeypatch):
+    work, store = Work(), CheckpointStore(tmp_path)
+    assert store.buffer_rows() == 0
+    with pytest.raises(CheckpointError, match="there is no checkpoint under"):
+        store.read_row(0)
+    for step in range(1, 10):  # 45 rows into a buffer of 30: the oldest 15 are lost
+        store.save(step, work.do().parts, work.buffer)
+    assert store.buffer_rows() == 30
+    stored = work.buffer[:]["x"]
+    opened = []
+    read = store.journal._read
+    monkeypatch.setattr(store.journal, "_read", lambda entry: opened.append(entry["file"]) or read(entry))
+    for row in (0, 13, 29):
+        position = (15 + row) % 30
+        assert torch.equal(store.read_row(row)["x"], stored[position])
+    assert len(opened) == 3
+    with pytest.raises(IndexError, match=r"row must be in \[0, 30\), the rows of the saved buffer, got 30"):
+        store.read_row(30)
+    for file in (tmp_path / "replay").glob("rows-*"):
+        file.write_bytes(b"")
+    with pytest.raises(CheckpointError, match="is not the file that was written"):
+        store.read_row(3)

@@ -84,7 +84,7 @@ def latent_plane(
                 name=name,
                 legendgroup=name,
                 showlegend=head == 0,
-                customdata=chosen,
+                customdata=chosen.tolist(),  # dash finds nothing in what plotly packs
                 hovertemplate=f"{name} %{{customdata}}<br>score %{{marker.color:.3f}}<extra></extra>",
                 marker={
                     "symbol": symbol,
@@ -131,7 +131,7 @@ def _add_paths(
             name=name,
             legendgroup=name,
             showlegend=head == 0,
-            hovertemplate=f"{name}, step %{{pointNumber}}<extra></extra>",
+            hoverinfo="skip",  # or it would catch clicks that are meant for a candidate
             line={"color": colour, "dash": dash, "width": 2},
             marker={"symbol": symbol, "size": sizes, "color": colour, "line": {"width": 1, "color": "white"}},
             **place,

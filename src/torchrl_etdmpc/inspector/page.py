@@ -492,7 +492,7 @@ def _state_of(source: str, episode: Any, step: Any) -> State:
 
 
 def _connect_figures(app: Any, inspection: Inspection) -> None:
-    from dash import Input, Output, State, no_update
+    from dash import Input, Output, State, ctx, no_update
 
     moving = ("latent_plane", "return_table", "disagreement", "plan_gaussian", "mixture_weights")
     still = [name for name in figures.FIGURES if name not in moving]
@@ -508,15 +508,17 @@ def _connect_figures(app: Any, inspection: Inspection) -> None:
         Input("latent_plane-a", "clickData"),
         Input("latent_plane-b", "clickData"),
         Input("unclick", "n_clicks"),
+        State("iteration", "value"),
+        State("iteration", "max"),
+        State("depth", "value"),
+        State("depth", "max"),
+        State("candidate", "data"),
         prevent_initial_call=True,
     )
-    def follow(one: int | None, two: int | None, click_a: Any, click_b: Any, _: Any) -> tuple[Any, ...]:
-        from dash import ctx
-
+    def follow(one: int | None, two: int | None, click_a: Any, click_b: Any, _: Any, *now: Any) -> tuple[Any, ...]:
         for side, click in (("a", click_a), ("b", click_b)):
             if ctx.triggered_id == f"latent_plane-{side}":
-                point = click["points"][0]
-                found = point.get("customdata")
+                found = click["points"][0].get("customdata")
                 candidate = no_update if found is None else {"side": side, "candidate": int(found)}
                 return *[no_update] * 4, candidate
         if ctx.triggered_id == "unclick":
@@ -525,7 +527,14 @@ def _connect_figures(app: Any, inspection: Inspection) -> None:
         if not traces:
             return (no_update,) * 5
         iterations, horizon = (max(getattr(trace, name) for trace in traces) for name in ("iterations", "horizon"))
-        return iterations, iterations, horizon, horizon, None
+        iteration, most_iterations, depth, most_depth, clicked = now
+        return (
+            iterations,
+            _followed(iteration, most_iterations, iterations),
+            horizon,
+            _followed(depth, most_depth, horizon),
+            no_update if clicked is None else None,
+        )
 
     for side in "ab":
 
@@ -587,6 +596,14 @@ def _connect_figures(app: Any, inspection: Inspection) -> None:
         assert one is not None and two is not None
         first, second = inspection.traces[one], inspection.traces[two]
         return figures.compare_plans(first, second), _difference_table(setting_rows(first, second))
+
+
+def _followed(value: int, most: int, now: int) -> Any:
+    """Where a scrubber goes when its end moves: what stood at the end stays there, all else stays where it is."""
+    from dash import no_update
+
+    target = now if value >= most else min(value, now)
+    return no_update if target == value else target
 
 
 def _described(trace: Any, side: str) -> list[Any]:
