@@ -196,7 +196,8 @@ class Page:
             message = json.loads(entry["message"])["message"]
             if message["method"] == "Network.requestWillBeSent":
                 address = urlsplit(message["params"]["request"]["url"])
-                inside = address.scheme in ("data", "file", "blob", "chrome", "about")
+                own = address.scheme.startswith("chrome")  # of the browser's own first page
+                inside = own or address.scheme in ("data", "file", "blob", "about")
                 assert inside or address.hostname == "127.0.0.1", address.geturl()
 
 

@@ -11,8 +11,7 @@ from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.modules import CEMPlanner, MPPIPlanner
 
-from torchrl_etdmpc.inspector.trace import FORMAT, KIND, Trace, as_array, latent_views
-from torchrl_etdmpc.runs import library_versions
+from torchrl_etdmpc.inspector.trace import FORMAT, KIND, Trace, as_array, latent_views, versions
 
 __all__ = ["trace_torchrl_planner"]
 
@@ -96,7 +95,7 @@ def trace_torchrl_planner(
         "explore": False,
         "fallback": False,
         "state": {},
-        "versions": library_versions(),
+        "versions": dict(versions()),
         "seconds": round(time.perf_counter() - started, 4),
     }
     return Trace(manifest | about, {name: as_array(tensor) for name, tensor in tensors.items()})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import json
@@ -37,6 +38,7 @@ __all__ = ["Cancelled", "Trace", "TraceError", "load_trace", "trace_plan"]
 FORMAT = 1
 KIND = "torchrl_etdmpc trace"
 COMPONENTS = 3
+versions = functools.cache(library_versions)  # which looks into files
 _BASIS_ROWS = 8192  # latents that the principal components are fitted to, evenly spread over all
 _MOST_BYTES = 2**30  # of a trace in memory
 
@@ -338,7 +340,7 @@ def trace_plan(
         "explore": explore,
         "fallback": bool(plan.fallback[0]),
         "state": {},
-        "versions": library_versions(),
+        "versions": dict(versions()),
         "seconds": round(time.perf_counter() - started, 4),
     }
     return Trace(manifest | about, {name: as_array(tensor) for name, tensor in tensors.items()})
