@@ -324,7 +324,7 @@ def test_a_trace_is_saved_under_a_name_that_says_so(tmp_path):
 
 
 def test_a_trace_of_full_size_is_below_20_mb(tmp_path):
-    """Of the largest action space of the benchmarks, 38 dimensions, with small networks: sizes do not depend on them."""
+    """Of the largest action space of the benchmarks, with small networks: sizes do not depend on them."""
     model = WorldModel(3, 38, latent_dim=64, mlp_dim=16, encoder_dim=16, num_dynamics=4)
     planner = EnsembleMPPIPlanner(LatentEnv(model))  # the defaults are those of the full size: 512 candidates
     trace = trace_plan(planner, OBSERVATION)

@@ -298,7 +298,7 @@ def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None
     """How far apart the heads are by depth: standard deviation of the returns, and distance of the latents."""
     if trace.get("returns") is None and trace.get("latent_spread") is None:
         return empty("this planner has no heads")
-    figure = _figure(rows=1, cols=2, subplot_titles=["returns", "latents"], horizontal_spacing=0.14)
+    figure = _figure(rows=1, cols=2, subplot_titles=["returns", "latents"], horizontal_spacing=0.22)
     elites = trace["elites"][iteration]
     tables, spreads = [], []
     if trace.get("returns") is not None:

@@ -12,6 +12,7 @@ from torchrl_etdmpc.inspector import figures
 from torchrl_etdmpc.inspector.inspection import Inspection, Job, State
 from torchrl_etdmpc.inspector.saved_page import WIDE, facts_of, frames_of, picture, setting_rows, write_page
 from torchrl_etdmpc.inspector.settings import PlannerSetting, plain_settings
+from torchrl_etdmpc.inspector.trace import Trace
 
 __all__ = ["make_page", "serve"]
 
@@ -492,82 +493,96 @@ def _state_of(source: str, episode: Any, step: Any) -> State:
 
 
 def _connect_figures(app: Any, inspection: Inspection) -> None:
-    from dash import Input, Output, State, ctx, no_update
+    from dash import Input, Output, State, no_update
 
     moving = ("latent_plane", "return_table", "disagreement", "plan_gaussian", "mixture_weights")
     still = [name for name in figures.FIGURES if name not in moving]
 
-    @app.callback(
-        Output("iteration", "max"),
-        Output("iteration", "value"),
-        Output("depth", "max"),
-        Output("depth", "value"),
+    # In the browser, so that a click costs one way to this process and not two.
+    app.clientside_callback(
+        """function (one, two, clickA, clickB, unclick) {
+            const context = dash_clientside.callback_context;
+            const cause = context.triggered.length ? context.triggered[0].prop_id : "";
+            for (const [side, click] of [["a", clickA], ["b", clickB]]) {
+                if (cause === `latent_plane-${side}.clickData`) {
+                    const found = click && click.points[0].customdata;
+                    return found === undefined || found === null ? dash_clientside.no_update
+                        : {side: side, candidate: found};
+                }
+            }
+            return null;
+        }""",
         Output("candidate", "data"),
         Input("trace-a", "data"),
         Input("trace-b", "data"),
         Input("latent_plane-a", "clickData"),
         Input("latent_plane-b", "clickData"),
         Input("unclick", "n_clicks"),
+        prevent_initial_call=True,
+    )
+
+    @app.callback(
+        Output("iteration", "max"),
+        Output("iteration", "value"),
+        Output("depth", "max"),
+        Output("depth", "value"),
+        Input("trace-a", "data"),
+        Input("trace-b", "data"),
         State("iteration", "value"),
         State("iteration", "max"),
         State("depth", "value"),
         State("depth", "max"),
-        State("candidate", "data"),
         prevent_initial_call=True,
     )
-    def follow(one: int | None, two: int | None, click_a: Any, click_b: Any, _: Any, *now: Any) -> tuple[Any, ...]:
-        for side, click in (("a", click_a), ("b", click_b)):
-            if ctx.triggered_id == f"latent_plane-{side}":
-                found = click["points"][0].get("customdata")
-                candidate = no_update if found is None else {"side": side, "candidate": int(found)}
-                return *[no_update] * 4, candidate
-        if ctx.triggered_id == "unclick":
-            return *[no_update] * 4, None
+    def follow(one: int | None, two: int | None, *now: Any) -> tuple[Any, ...]:
         traces = [inspection.traces[number] for number in (one, two) if number in inspection.traces]
         if not traces:
-            return (no_update,) * 5
+            return (no_update,) * 4
         iterations, horizon = (max(getattr(trace, name) for trace in traces) for name in ("iterations", "horizon"))
-        iteration, most_iterations, depth, most_depth, clicked = now
+        iteration, most_iterations, depth, most_depth = now
         return (
             iterations,
             _followed(iteration, most_iterations, iterations),
             horizon,
             _followed(depth, most_depth, horizon),
-            no_update if clicked is None else None,
         )
 
     for side in "ab":
+        # One callback a figure, each with what it depends on: a click or a scrubber draws no more than it changes.
+        chosen = (Input(f"trace-{side}", "data"), Input("iteration", "value"), Input("candidate", "data"))
 
         @app.callback(
-            *[Output(f"{name}-{side}", "figure") for name in moving],
-            Input(f"trace-{side}", "data"),
-            Input("iteration", "value"),
+            Output(f"latent_plane-{side}", "figure"),
+            *chosen,
             Input("depth", "value"),
             Input("components", "value"),
-            Input("candidate", "data"),
             prevent_initial_call=True,
         )
-        def move(
-            number: int | None, iteration: int, depth: int, components: str, clicked: Any, side: str = side
-        ) -> tuple[Any, ...]:
-            trace = inspection.traces.get(number) if number is not None else None
-            if trace is None or not iteration or not depth:
-                return (no_update,) * len(moving)
-            at = min(iteration, trace.iterations) - 1
-            candidate = clicked["candidate"] if clicked and clicked["side"] == side else None
-            if candidate is not None and candidate >= trace["scores"].shape[1]:
-                candidate = None
-            plane = figures.latent_plane(
-                trace,
-                at,
-                depth=min(depth, trace.horizon),
-                components=(int(components[0]), int(components[1])),
-                candidate=candidate if trace.get("points") is not None else None,
-            )
-            table = figures.return_table(trace, at, candidate)
-            weights = figures.mixture_weights(trace, candidate)
-            apart = figures.disagreement(trace, at, candidate)
-            return plane, table, apart, figures.plan_gaussian(trace, at), weights
+        def plane(number: Any, iteration: int, clicked: Any, depth: int, components: str, side: str = side) -> Any:
+            trace, at, candidate = _looked_at(inspection, number, iteration, clicked, side)
+            if trace is None:
+                return no_update
+            candidate = None if trace.get("points") is None else candidate
+            axes = int(components[0]), int(components[1])
+            depth = min(depth, trace.horizon)
+            return figures.latent_plane(trace, at, depth=depth, components=axes, candidate=candidate)
+
+        for name in ("return_table", "disagreement"):
+
+            @app.callback(Output(f"{name}-{side}", "figure"), *chosen, prevent_initial_call=True)
+            def of_candidate(number: Any, iteration: int, clicked: Any, side: str = side, name: str = name) -> Any:
+                trace, at, candidate = _looked_at(inspection, number, iteration, clicked, side)
+                return no_update if trace is None else getattr(figures, name)(trace, at, candidate)
+
+        @app.callback(Output(f"plan_gaussian-{side}", "figure"), *chosen[:2], prevent_initial_call=True)
+        def gaussian(number: Any, iteration: int, side: str = side) -> Any:
+            trace, at, _ = _looked_at(inspection, number, iteration, None, side)
+            return no_update if trace is None else figures.plan_gaussian(trace, at)
+
+        @app.callback(Output(f"mixture_weights-{side}", "figure"), chosen[0], chosen[2], prevent_initial_call=True)
+        def weights(number: Any, clicked: Any, side: str = side) -> Any:
+            trace, _, candidate = _looked_at(inspection, number, 1, clicked, side)
+            return no_update if trace is None else figures.mixture_weights(trace, candidate)
 
         @app.callback(
             *[Output(f"{name}-{side}", "figure") for name in still],
@@ -598,6 +613,19 @@ def _connect_figures(app: Any, inspection: Inspection) -> None:
         return figures.compare_plans(first, second), _difference_table(setting_rows(first, second))
 
 
+def _looked_at(
+    inspection: Inspection, number: int | None, iteration: int, clicked: Any, side: str
+) -> tuple[Trace | None, int, int | None]:
+    """A side's trace if it is there, the iteration from 0, and the candidate that was clicked there."""
+    trace = None if number is None else inspection.traces.get(number)
+    if trace is None:
+        return None, 0, None
+    candidate = clicked["candidate"] if clicked and clicked["side"] == side else None
+    if candidate is not None and candidate >= trace["scores"].shape[1]:
+        candidate = None
+    return trace, min(iteration, trace.iterations) - 1, candidate
+
+
 def _followed(value: int, most: int, now: int) -> Any:
     """Where a scrubber goes when its end moves: what stood at the end stays there, all else stays where it is."""
     from dash import no_update
@@ -606,7 +634,7 @@ def _followed(value: int, most: int, now: int) -> Any:
     return no_update if target == value else target
 
 
-def _described(trace: Any, side: str) -> list[Any]:
+def _described(trace: Trace, side: str) -> list[Any]:
     from dash import html
 
     facts = [html.Li([f"{name} ", html.B(text)]) for name, text in facts_of(trace).items()]
