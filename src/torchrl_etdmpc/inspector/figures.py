@@ -24,6 +24,7 @@ __all__ = [
     "latent_plane",
     "mixture_weights",
     "plan_and_policy",
+    "plain_latent_plane",
     "plan_gaussian",
     "return_table",
     "reward_check",
@@ -35,6 +36,13 @@ GREY = "#7f7f7f"
 _COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, VERMILION)
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
 _MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "x")
+_LAYOUT: dict[str, Any] = {
+    "paper_bgcolor": "rgba(0,0,0,0)",
+    "plot_bgcolor": "rgba(0,0,0,0)",
+    "font": {"family": "system-ui, sans-serif", "size": 12, "color": GREY},
+    "margin": {"l": 55, "r": 15, "t": 30, "b": 45},
+    "legend": {"orientation": "h", "y": 1.15},
+}
 _MOST_LINES = 6  # action dimensions that are drawn as lines; more are an image
 
 
@@ -61,62 +69,93 @@ def latent_plane(
         components (tuple of int): the two that span the plane, from 0.
         candidate (int, optional): one to mark by a ring.
     """
+    from plotly import graph_objects
+
+    options: dict[str, Any] = {"depth": depth, "components": components, "candidate": candidate}
+    return graph_objects.Figure(plain_latent_plane(trace, iteration, **options)).update_layout(template="none")
+
+
+def plain_latent_plane(
+    trace: Trace,
+    iteration: int = -1,
+    *,
+    depth: int | None = None,
+    components: tuple[int, int] = (0, 1),
+    candidate: int | None = None,
+) -> Any:
+    """:func:`latent_plane` as plain dictionaries, without the tenth of a second that plotly's checks take."""
     points = trace.get("points")
     if points is None:
-        return empty("this planner shows no latents")
+        return empty("this planner shows no latents").to_plotly_json()
     depth = trace.horizon if depth is None else depth
-    first, second = (min(number, points.shape[-1] - 1) for number in components)
+    axes = [min(number, points.shape[-1] - 1) for number in components]
     heads, scores = points.shape[3], trace["scores"][iteration]
-    figure = _figure(
-        rows=1, cols=heads, subplot_titles=[f"head {head + 1}" for head in range(heads)], horizontal_spacing=0.03
-    )
     kinds = _kinds(trace, iteration)
-    low, high = _range(scores)
-    share = trace["explained"]
+    layout, traces = _plane_layout(trace, axes, scores), []
     for head in range(heads):
+        number = str(head + 1) if head else ""
+        place = {"xaxis": f"x{number}", "yaxis": f"y{number}", "showlegend": head == 0, "type": "scatter"}
         where = points[iteration, :, depth - 1, head]
         for name, symbol, size in (("candidate", "circle", 6), ("elite", "diamond", 9), ("proposal", "triangle-up", 9)):
-            chosen = np.flatnonzero(kinds == name)
-            figure.add_scatter(
-                x=where[chosen, first],
-                y=where[chosen, second],
-                mode="markers",
-                name=name,
-                legendgroup=name,
-                showlegend=head == 0,
-                customdata=chosen.tolist(),  # dash finds nothing in what plotly packs
-                hovertemplate=f"{name} %{{customdata}}<br>score %{{marker.color:.3f}}<extra></extra>",
-                marker={
-                    "symbol": symbol,
-                    "size": size,
-                    "color": scores[chosen],
-                    "coloraxis": "coloraxis",
-                    "line": {"width": 1.2 if name != "candidate" else 0.5, "color": GREY},
-                },
-                row=1,
-                col=head + 1,
+            shown = np.flatnonzero(kinds == name)
+            traces.append(
+                {
+                    "x": where[shown, axes[0]],
+                    "y": where[shown, axes[1]],
+                    "mode": "markers",
+                    "name": name,
+                    "legendgroup": name,
+                    "customdata": shown.tolist(),  # dash finds nothing in what plotly packs
+                    "hovertemplate": f"{name} %{{customdata}}<br>score %{{marker.color:.3f}}<extra></extra>",
+                    "marker": {
+                        "symbol": symbol,
+                        "size": size,
+                        "color": scores[shown],
+                        "coloraxis": "coloraxis",
+                        "line": {"width": 1.2 if name != "candidate" else 0.5, "color": GREY},
+                    },
+                    **place,
+                }
             )
-        _add_paths(figure, trace, iteration, head, depth, (first, second), candidate)
-        figure.update_xaxes(title_text=f"component {first + 1} ({share[first]:.0%})", row=1, col=head + 1)
-    figure.update_yaxes(title_text=f"component {second + 1} ({share[second]:.0%})", row=1, col=1)
-    figure.update_xaxes(matches="x")
-    figure.update_yaxes(matches="y")
-    figure.update_layout(
-        coloraxis={"colorscale": "Cividis", "cmin": low, "cmax": high, "colorbar": {"title": "score", "thickness": 12}},
-        legend={"orientation": "h", "y": -0.2},
-        clickmode="event",
-        height=400,
-    )
-    return figure
+        for path in _paths(trace, iteration, head, depth, axes, candidate):
+            traces.append(path | place)
+    return {"data": traces, "layout": layout}
 
 
-def _add_paths(
-    figure: Any, trace: Trace, iteration: int, head: int, depth: int, axes: tuple[int, int], candidate: int | None
-) -> None:
+def _plane_layout(trace: Trace, axes: list[int], scores: np.ndarray) -> dict[str, Any]:
+    """Panels side by side, which share their axes."""
+    low, high = _range(scores)
+    layout: dict[str, Any] = dict(_LAYOUT)
+    heads, gap, share = trace.num_dynamics, 0.03, trace["explained"]
+    width = (1 - gap * (heads - 1)) / heads
+    layout["annotations"] = []
+    for head in range(heads):
+        number, left = str(head + 1) if head else "", head * (width + gap)
+        lines = {"gridcolor": "rgba(127,127,127,0.25)", "zerolinecolor": "rgba(127,127,127,0.5)"}
+        title = {"text": f"component {axes[0] + 1} ({share[axes[0]]:.0%})"}
+        layout[f"xaxis{number}"] = lines | {"domain": [left, left + width], "anchor": f"y{number}", "title": title}
+        layout[f"yaxis{number}"] = lines | {"domain": [0, 1], "anchor": f"x{number}"}
+        if head:
+            layout[f"xaxis{number}"]["matches"] = "x"
+            layout[f"yaxis{number}"] |= {"matches": "y", "showticklabels": False}
+        text = {"text": f"head {head + 1}", "x": left + width / 2, "y": 1, "yanchor": "bottom", "showarrow": False}
+        layout["annotations"].append(text | {"xref": "paper", "yref": "paper", "font": {"size": 13}})
+    layout["yaxis"]["title"] = {"text": f"component {axes[1] + 1} ({share[axes[1]]:.0%})"}
+    bar = {"title": {"text": "score"}, "thickness": 12}
+    return layout | {
+        "coloraxis": {"colorscale": "Cividis", "cmin": low, "cmax": high, "colorbar": bar},
+        "legend": {"orientation": "h", "y": -0.2},
+        "clickmode": "event",
+        "height": 400,
+    }
+
+
+def _paths(
+    trace: Trace, iteration: int, head: int, depth: int, axes: list[int], candidate: int | None
+) -> list[dict[str, Any]]:
     """The chosen sequence, the simulator's and the ring around a candidate, in one head's panel."""
-    place = {"row": 1, "col": head + 1}
     start = trace["start_point"][None]
-    paths = []
+    paths, drawn = [], []
     if trace.get("chosen_points") is not None:
         path = np.concatenate([start, trace["chosen_points"][:depth, head]])
         paths.append(("chosen", path, "solid", "star", VERMILION))
@@ -124,31 +163,33 @@ def _add_paths(
         paths.append(("simulator", trace["real_points"][: depth + 1], "dot", "x", GREEN))
     for name, path, dash, symbol, colour in paths:
         sizes = [5] * (len(path) - 1) + [14]
-        figure.add_scatter(
-            x=path[:, axes[0]],
-            y=path[:, axes[1]],
-            mode="lines+markers",
-            name=name,
-            legendgroup=name,
-            showlegend=head == 0,
-            hoverinfo="skip",  # or it would catch clicks that are meant for a candidate
-            line={"color": colour, "dash": dash, "width": 2},
-            marker={"symbol": symbol, "size": sizes, "color": colour, "line": {"width": 1, "color": "white"}},
-            **place,
+        drawn.append(
+            {
+                "x": path[:, axes[0]],
+                "y": path[:, axes[1]],
+                "mode": "lines+markers",
+                "name": name,
+                "legendgroup": name,
+                "hoverinfo": "skip",  # or it would catch clicks that are meant for a candidate
+                "line": {"color": colour, "dash": dash, "width": 2},
+                "marker": {"symbol": symbol, "size": sizes, "color": colour, "line": {"width": 1, "color": "white"}},
+            }
         )
     if candidate is not None:
-        x, y = trace["points"][iteration, candidate, depth - 1, head, list(axes)]
-        figure.add_scatter(
-            x=[x],
-            y=[y],
-            mode="markers",
-            name="clicked",
-            legendgroup="clicked",
-            showlegend=head == 0,
-            hoverinfo="skip",
-            marker={"symbol": "circle-open", "size": 18, "color": PINK, "line": {"width": 3}},
-            **place,
+        x, y = trace["points"][iteration, candidate, depth - 1, head, axes]
+        ring = {"symbol": "circle-open", "size": 18, "color": PINK, "line": {"width": 3}}
+        drawn.append(
+            {
+                "x": [x],
+                "y": [y],
+                "mode": "markers",
+                "name": "clicked",
+                "legendgroup": "clicked",
+                "hoverinfo": "skip",
+                "marker": ring,
+            }
         )
+    return drawn
 
 
 def score_spread(trace: Trace) -> go.Figure:
@@ -415,14 +456,7 @@ def _figure(**subplots: Any) -> Any:
     from plotly.subplots import make_subplots
 
     figure = make_subplots(**subplots) if subplots else graph_objects.Figure()
-    figure.update_layout(
-        template="none",
-        paper_bgcolor="rgba(0,0,0,0)",
-        plot_bgcolor="rgba(0,0,0,0)",
-        font={"family": "system-ui, sans-serif", "size": 12, "color": GREY},
-        margin={"l": 55, "r": 15, "t": 30, "b": 45},
-        legend={"orientation": "h", "y": 1.15},
-    )
+    figure.update_layout(template="none", **_LAYOUT)
     figure.update_xaxes(gridcolor="rgba(127,127,127,0.25)", zerolinecolor="rgba(127,127,127,0.5)")
     figure.update_yaxes(gridcolor="rgba(127,127,127,0.25)", zerolinecolor="rgba(127,127,127,0.5)")
     return figure

@@ -565,7 +565,7 @@ def _connect_figures(app: Any, inspection: Inspection) -> None:
             candidate = None if trace.get("points") is None else candidate
             axes = int(components[0]), int(components[1])
             depth = min(depth, trace.horizon)
-            return figures.latent_plane(trace, at, depth=depth, components=axes, candidate=candidate)
+            return figures.plain_latent_plane(trace, at, depth=depth, components=axes, candidate=candidate)
 
         for name in ("return_table", "disagreement"):
 
