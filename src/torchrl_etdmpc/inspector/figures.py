@@ -1,4 +1,4 @@
-"""Figures of a trace with plotly: each is made from the trace alone.
+"""Figures of a trace with plotly (``plotly.graph_objects.Figure``): each is made from the trace alone.
 
 Marks differ in shape as well as in colour, and the colours (cividis, and those of Okabe and Ito) are told apart by
 colour-blind people. Backgrounds are transparent, so that a page can be light, dark or printed.
@@ -6,14 +6,11 @@ colour-blind people. Backgrounds are transparent, so that a page can be light, d
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from torchrl_etdmpc.inspector.trace import Trace
-
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
 
 __all__ = [
     "FIGURES",
@@ -53,7 +50,7 @@ def latent_plane(
     depth: int | None = None,
     components: tuple[int, int] = (0, 1),
     candidate: int | None = None,
-) -> go.Figure:
+) -> Any:
     """Where an iteration's candidates lead, in principal components of latent space, one panel a dynamics head.
 
     Circles are candidates, diamonds elites, triangles proposals of the policy, coloured by score; the star and its line
@@ -192,7 +189,7 @@ def _paths(
     return drawn
 
 
-def score_spread(trace: Trace) -> go.Figure:
+def score_spread(trace: Trace) -> Any:
     """Best, median and worst elite score and the median candidate's after every iteration, and the policy's own."""
     scores = np.where(np.isfinite(trace["scores"]), trace["scores"], -np.inf)
     elites = np.take_along_axis(scores, trace["elites"], 1)
@@ -214,7 +211,7 @@ def score_spread(trace: Trace) -> go.Figure:
     return figure.update_layout(height=300)
 
 
-def plan_gaussian(trace: Trace, iteration: int = -1) -> go.Figure:
+def plan_gaussian(trace: Trace, iteration: int = -1) -> Any:
     """Mean and standard deviation of every action dimension at every step, as one iteration left them."""
     mean, std = trace["mean"][iteration], trace["std"][iteration]
     steps = np.arange(1, len(mean) + 1)
@@ -264,7 +261,7 @@ def candidate_table(trace: Trace, iteration: int, candidate: int) -> np.ndarray 
     return None if trace.get("returns") is None else trace["returns"][iteration, candidate]
 
 
-def return_table(trace: Trace, iteration: int = -1, candidate: int | None = None) -> go.Figure:
+def return_table(trace: Trace, iteration: int = -1, candidate: int | None = None) -> Any:
     """Return table of a candidate, depth x dynamics head and value head; by default that of the chosen sequence."""
     if candidate is None:
         table, title = trace.get("chosen_returns"), "chosen sequence"
@@ -292,7 +289,7 @@ def return_table(trace: Trace, iteration: int = -1, candidate: int | None = None
     return figure.update_layout(height=max(280, 150 + 28 * depths), title={"text": title, "font": {"size": 13}})
 
 
-def mixture_weights(trace: Trace, candidate: int | None = None) -> go.Figure:
+def mixture_weights(trace: Trace, candidate: int | None = None) -> Any:
     """Weights that the adaptive score gives the depths, elites' mean in every iteration (thesis Fig. 4.1).
 
     With a candidate, that candidate's number in every iteration instead.
@@ -321,7 +318,7 @@ def mixture_weights(trace: Trace, candidate: int | None = None) -> go.Figure:
     return figure.update_layout(height=max(260, 110 + 26 * rows.shape[0]))
 
 
-def plan_and_policy(trace: Trace) -> go.Figure:
+def plan_and_policy(trace: Trace) -> Any:
     """First action of the plan beside the policy's own."""
     names = [f"action {number + 1}" for number in range(trace["action"].shape[0])]
     figure = _figure()
@@ -335,7 +332,7 @@ def plan_and_policy(trace: Trace) -> go.Figure:
     return figure.update_layout(height=300, barmode="group")
 
 
-def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None) -> go.Figure:
+def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None) -> Any:
     """How far apart the heads are by depth: standard deviation of the returns, and distance of the latents."""
     if trace.get("returns") is None and trace.get("latent_spread") is None:
         return empty("this planner has no heads")
@@ -372,7 +369,7 @@ def disagreement(trace: Trace, iteration: int = -1, candidate: int | None = None
     return figure.update_layout(height=300, legend={"orientation": "h", "y": -0.4}, margin={"b": 80})
 
 
-def reward_check(trace: Trace) -> go.Figure:
+def reward_check(trace: Trace) -> Any:
     """Rewards of the chosen sequence: by each head, and in the simulator."""
     if trace.get("chosen_rewards") is None:
         return empty("this planner says no rewards of its choice")
@@ -392,7 +389,7 @@ def reward_check(trace: Trace) -> go.Figure:
     return figure.update_layout(height=300)
 
 
-def compare_plans(trace: Trace, other: Trace) -> go.Figure:
+def compare_plans(trace: Trace, other: Trace) -> Any:
     """Difference of two traces' final means and chosen first actions, second less first, by action dimension."""
     steps = min(trace.horizon, other.horizon)
     gap = other["mean"][-1, :steps] - trace["mean"][-1, :steps]

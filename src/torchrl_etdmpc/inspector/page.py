@@ -18,7 +18,7 @@ __all__ = ["make_page", "serve"]
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _PATIENCE = 0.4  # seconds after which a plan shows its progress
-_GRAPH = {"displayModeBar": False, "responsive": True}
+_GRAPH: Any = {"displayModeBar": False, "responsive": True}
 _AS_GIVEN = "as given"  # a score of one's own
 
 
@@ -319,7 +319,7 @@ def _main() -> list[Any]:
             html.Div(
                 dcc.Graph(figure=figures.empty("no plan yet"), id=f"{name}-{side}", config=_GRAPH),
                 className=f"side-{side}",
-            )  # pyright: ignore[reportArgumentType]
+            )
             for side in "ab"
         ]
         wide = " wide" if name in WIDE else ""

@@ -59,7 +59,7 @@ def write_page(
         "sides": [_side(side) for side in sides],
     }
     if other is not None:
-        content["difference"] = json.loads(figures.compare_plans(trace, other).to_json())
+        content["difference"] = _plain(figures.compare_plans(trace, other))
     write_whole(folder / "plotly.min.js", script)
     write_whole(folder / "data.js", f"window.INSPECTION = {json.dumps(content)};\n")
     for source in (
@@ -157,17 +157,21 @@ def _numbers(values: np.ndarray) -> str:
     return shown + (", ..." if len(values) > 6 else "")
 
 
+def _plain(figure: Any) -> Any:
+    return json.loads(figure.to_json())
+
+
 def _side(trace: Trace) -> dict[str, Any]:
     """Everything that the script draws of one trace."""
     made: dict[str, Any] = {}
     for name in figures.FIGURES:
         function = getattr(figures, name)
         if name == "return_table":
-            made[name] = json.loads(function(trace).to_json())
+            made[name] = _plain(function(trace))
         elif name in MOVING:
-            made[name] = [json.loads(function(trace, iteration).to_json()) for iteration in range(trace.iterations)]
+            made[name] = [_plain(function(trace, iteration)) for iteration in range(trace.iterations)]
         else:
-            made[name] = json.loads(function(trace).to_json())
+            made[name] = _plain(function(trace))
     side: dict[str, Any] = {"figures": made}
     scores = trace["scores"]
     side["scores"] = [[float(score) if np.isfinite(score) else None for score in row] for row in scores]

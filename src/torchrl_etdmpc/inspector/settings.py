@@ -157,7 +157,9 @@ def _setting(parameter: inspect.Parameter, hint: Any) -> PlannerSetting:
         choice for option in options if typing.get_origin(option) is Literal for choice in typing.get_args(option)
     )
     kinds: dict[Any, Kind] = {bool: "switch", int: "whole", float: "number"}
-    kind = "choice" if choices else next((kinds[option] for option in options if option in kinds), "other")
+    kind: Kind = "choice" if choices else "other"
+    if not choices:
+        kind = next((kinds[option] for option in options if option in kinds), kind)
     default = None if parameter.default is parameter.empty else parameter.default
     return PlannerSetting(parameter.name, kind, choices, type(None) in options, default)
 

@@ -389,8 +389,9 @@ class Components(NamedTuple):
 def principal_components(latents: Tensor) -> Components:
     """The components of rows ``[M, L]``, at most three.
 
-    >>> principal_components(torch.tensor([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]])).basis[0].round(decimals=2).tolist()
-    [0.7100000381469727, 0.7100000381469727]
+    >>> components = principal_components(torch.tensor([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]]))
+    >>> components.project(torch.tensor([2.0, 2.0])).abs().max().item() < 1e-6
+    True
     """
     rows = latents[:: math.ceil(len(latents) / _BASIS_ROWS)].double()
     centre = rows.mean(0)
