@@ -158,8 +158,8 @@ def _setting(parameter: inspect.Parameter, hint: Any) -> PlannerSetting:
     )
     kinds: dict[Any, Kind] = {bool: "switch", int: "whole", float: "number"}
     kind: Kind = "choice" if choices else "other"
-    if not choices:
-        kind = next((kinds[option] for option in options if option in kinds), kind)
+    for option in () if choices else options:
+        kind = kinds.get(option, kind)
     default = None if parameter.default is parameter.empty else parameter.default
     return PlannerSetting(parameter.name, kind, choices, type(None) in options, default)
 
