@@ -204,7 +204,7 @@ class Page:
 @pytest.fixture
 def page(tmp_path, monkeypatch) -> Iterator[Page]:
     selenium = pytest.importorskip("selenium.webdriver")
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    chromium, driver = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         pytest.skip("needs chromium and chromedriver: apt-get install chromium chromium-driver")
     from selenium.webdriver.chrome.service import Service
