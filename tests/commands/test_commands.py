@@ -62,9 +62,7 @@ def test_the_sdist_holds_the_checkout():
     assert tops - set(manifest) <= {"MANIFEST.in", "pyproject.toml"}  # these two are always there
 
 
-@pytest.mark.parametrize(
-    "name", ["train", "distributed", "evaluate", "export", "report", "study", "inspect_planner"]
-)
+@pytest.mark.parametrize("name", ["train", "distributed", "evaluate", "export", "report", "study", "inspect_planner"])
 def test_every_command_has_a_help_that_says_what_it_takes(run_command, name):
     message, out, err = run_command(name, "--help")
     assert message in (None, 0)
