@@ -5,9 +5,11 @@ TASK ?= walker-stand
 RUN_DIR ?= runs/$(TASK)
 JOBS ?= 3
 ARGS ?=
+PORT ?= 8000
 
 VENV := .venv
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs-ready
 # HumanoidBench simulates what it was published with only on an older MuJoCo, so it has an environment of its own.
 HUMANOID_BENCH ?=
 HUMANOID_REPOSITORY := https://github.com/carlosferrazza/humanoid-bench
@@ -17,7 +19,7 @@ HUMANOID_VENV := .venv-humanoidbench
 SAME_RUN = $(if $(filter command line,$(origin RUN_DIR)), RUN_DIR="$(RUN_DIR)",$(if $(filter command line,$(origin TASK)), TASK=$(TASK)))
 
 .DEFAULT_GOAL := help
-.PHONY: help train watch report test lint bench humanoidbench clean
+.PHONY: help train watch report test lint bench docs docs-serve humanoidbench clean
 
 help:
 	@echo "make train   train on a CPU in minutes (TASK=walker-stand, RUN_DIR=runs/TASK, ARGS=\"more settings\")"
@@ -26,6 +28,8 @@ help:
 	@echo "make test    run the tests and the examples in docstrings, JOBS=3 files at a time (ARGS=\"pytest options\")"
 	@echo "make lint    check style, format and types, as the commit hooks and CI do"
 	@echo "make bench   run the benchmarks (ARGS=\"pytest options\")"
+	@echo "make docs    build the site into build/docs/html: tutorials run, links and names are checked"
+	@echo "make docs-serve   show it on http://127.0.0.1:PORT, PORT=8000"
 	@echo "make humanoidbench   make $(HUMANOID_VENV), which simulates HumanoidBench (HUMANOID_BENCH=path of a clone)"
 	@echo "make clean   remove the environments, caches and build output; runs/ stays"
 	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
@@ -64,6 +68,24 @@ lint: $(READY)
 bench: $(READY)
 	@if [ -d benchmarks ]; then $(VENV)/bin/python -m pytest benchmarks --benchmark-only $(ARGS); \
 	else echo "error: there is no benchmarks/ here; run make bench in a full checkout" >&2; exit 1; fi
+
+# A warning is an error; the walk through the built pages is left out, and says so, where there is no Chromium.
+docs: export MUJOCO_GL ?= disable
+docs: export OMP_NUM_THREADS ?= 1
+docs: $(DOCS_READY)
+	@$(VENV)/bin/python -m sphinx -q -W --keep-going -n -c docs -d build/docs/doctrees . build/docs/html $(ARGS)
+	@$(VENV)/bin/python docs/check_site.py build/docs/html
+	@echo 'the site: build/docs/html/index.html, or: make docs-serve'
+
+docs-serve: $(DOCS_READY)
+	@test -f build/docs/html/index.html || { echo "error: there is no site yet; run make docs" >&2; exit 1; }
+	@echo "http://127.0.0.1:$(PORT), Ctrl-C ends it"
+	@$(VENV)/bin/python -m http.server --bind 127.0.0.1 --directory build/docs/html $(PORT)
+
+$(DOCS_READY): requirements-docs.txt $(READY)
+	@echo "installing what builds the documentation"
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements-docs.txt
+	@touch $@
 
 # The mark is written last, so that an interrupted installation starts over; and it starts from nothing, because
 # packages that share files (mujoco 3 and 4) cannot be replaced in place.

@@ -11,7 +11,9 @@ from torchrl_etdmpc.analysis.curves import POINT_COLUMNS
 from torchrl_etdmpc.analysis.statistics import add_interval, interpolate
 
 STEPS = (20_000, 50_000, 100_000, 200_000)
+"""Env steps at which reports table returns."""
 MEAN = "Mean over tasks"
+"""The name of the row over all tasks in tables of returns."""
 DASH = "–"
 _COLUMNS = ("env_steps", "method", "task", "mean", "standard_error", "lower", "upper", "seeds", "tasks", "kind")
 

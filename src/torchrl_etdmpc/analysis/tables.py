@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 AGGREGATE = "Normalized aggregate"
+"""The name of the row over all tasks in tables of normalised numbers."""
 
 
 def result_table(values: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str], column: str) -> pd.DataFrame:

@@ -14,6 +14,7 @@ from torchrl_etdmpc.functional import mish
 INIT_STD = 0.02
 
 Activation = Literal["mish", "silu", "relu"]
+"""What follows a normed layer."""
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {"mish": mish, "silu": F.silu, "relu": F.relu}
 
 
@@ -194,7 +195,7 @@ class LayerStack(nn.Module):
 
 
 class MLP(LayerStack):
-    """A :class:`LayerStack` from one tensor to one tensor.
+    """A ``LayerStack`` from one tensor to one tensor.
 
     >>> MLP(3, [16], 2, num_members=4)(torch.zeros(4, 7, 3)).shape
     torch.Size([4, 7, 2])

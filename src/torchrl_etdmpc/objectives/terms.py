@@ -20,8 +20,11 @@ from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, coun
 from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
 
 Reduction = Literal["none", "mean", "sum"]
+"""What a loss makes of the errors of its steps."""
 KLDirection = Literal["backward", "forward"]
+"""``"backward"`` is ``KL(pi || plan)``, ``"forward"`` is ``KL(plan || pi)``."""
 TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tensor, dict[str, Tensor]]]
+"""A term of one's own: errors ``[T, B]``, or errors and metrics."""
 
 PRIORITY = "priority"
 """Under which name among its metrics a term offers errors ``[T, B]`` to make priorities of, where there are weights."""
@@ -49,7 +52,7 @@ class Term:
             ``slices.extra``.
         metrics (tuple of str, optional): the metrics that it reports; ``<name>_error``, the mean error, is the loss's
             to fill in. Default: that one alone.
-        scalars (mapping of str to float): further numbers, which become buffers of the loss.
+        scalars (mapping): further numbers, which become buffers of the loss.
         decayed (bool): whether step k is weighted by ``rho^k``.
 
     >>> from torchrl.objectives import SoftUpdate
@@ -484,7 +487,7 @@ class LatentRolloutLoss(LossModule):
             coefficients and by ``rho^k`` at step k, and detached scalar metrics. Means are over the steps that count.
 
         Raises:
-            ValueError: as :meth:`slices`.
+            ValueError: as ``slices``.
             KeyError: if a key is missing.
         """
         terms = self.evaluate(self.slices(tensordict), self.targets(), self.reduction)
@@ -522,7 +525,7 @@ class LatentRolloutLoss(LossModule):
         """What :meth:`forward` returns, from plain tensors: the part that compiles as one graph.
 
         Args:
-            slices (Slices): from :meth:`slices`.
+            slices (Slices): from ``slices``.
             targets (mapping): from :meth:`targets`.
             reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 

@@ -50,7 +50,10 @@ from torchrl_etdmpc.planners.primer import PlanPrimer
 from torchrl_etdmpc.planners.scores import Score, ScoreFunction, ScoreName, make_score
 
 FirstAction = Literal["elite", "mean", "best"]
+"""Whose first action is the mean of the target: an elite drawn by its weight, the fitted mean, or the best
+candidate."""
 ScoringDtype = Literal["float16", "bfloat16", "float32", "float64"]
+"""Names of the dtypes in which candidates can be scored."""
 
 
 class EnsembleMPPIPlanner(MPCPlannerBase):

@@ -16,8 +16,11 @@ from torch import Tensor, nn
 from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
 
 Depths = Literal["last", "all"]
+"""How much of the return table a score reads."""
 ScoreName = Literal["final", "mean", "adaptive"]
+"""The scores that are chosen by name."""
 ScoreFunction = Callable[[Tensor], Tensor]
+"""A score of one's own: return estimates ``[..., D, F, V]`` to scores ``[...]``."""
 
 
 @runtime_checkable

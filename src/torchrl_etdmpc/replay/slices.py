@@ -16,6 +16,7 @@ from torchrl_etdmpc.keys import DONE, ENV_INDEX, IS_INIT, MASK, NEXT, TRAJECTORY
 from torchrl_etdmpc.replay.trajectories import Trajectories
 
 UniformOver = Literal["episodes", "starts"]
+"""What is drawn alike: first the episode, then the start in it, or any start."""
 
 
 class StepSliceSampler(Sampler):

@@ -21,7 +21,9 @@ from torchrl_etdmpc.runs.files import write_whole
 from torchrl_etdmpc.runs.versions import library_versions
 
 COUNTER_COLUMNS = ("env_steps", "decision_steps", "updates", "wall_time_s")
+"""The first columns of ``train.csv`` and ``eval.csv``."""
 EVAL_COLUMNS = (*COUNTER_COLUMNS, "return_mean", "return_std", "episodes")
+"""The columns that every ``eval.csv`` has."""
 
 Table = Literal["train", "eval"]
 

@@ -16,6 +16,7 @@ from torchrl_etdmpc.runs.errors import first_line
 from torchrl_etdmpc.runs.files import write_whole
 
 LoggerName = Literal["none", "tensorboard", "wandb"]
+"""Where numbers go besides a run's own files."""
 _WANDB_TIMEOUT_S = 30
 
 

@@ -77,7 +77,7 @@ def is_distributed(settings: Any) -> bool:
 class WorkerCollector:
     """Stands where :class:`~torchrl_etdmpc.collectors.StepCollector` does in a run; a step is a batch of one worker.
 
-    The workers plan and step in processes of their own (:func:`start_workers`) and go on while the learner updates, at
+    The workers plan and step in processes of their own (``start_workers``) and go on while the learner updates, at
     most two batches ahead of it. What is lost against one process:
 
     - freshness of each step: a decision is made with weights that are some updates old (``weight_age`` in

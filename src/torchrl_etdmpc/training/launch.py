@@ -39,6 +39,7 @@ CHANGEABLE = {
     "engine",
     "address",
 }
+"""Settings that may change when a run goes on."""
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ PRESETS: dict[str, TrainConfig] = {
         ),
     )
 }
+"""The named configurations."""
 
 
 def preset(name: str) -> TrainConfig:

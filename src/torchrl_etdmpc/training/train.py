@@ -135,7 +135,7 @@ class TrainingRun:
         return summary
 
     def precompile(self) -> None:
-        """Compiles what the run will call; see :func:`~torchrl_etdmpc.training.precompile.precompile`."""
+        """Compiles what the run will call; see ``training/precompile.py``."""
         batches = self.learner.collector.env.batch_size, self.evaluator.env.batch_size
         self._compile_s = precompile(self.config, self.learner.agent, *batches)
 

@@ -165,7 +165,7 @@ def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int 
     """Sends weights to a worker, and waits until it has them.
 
     Args:
-        collector (BaseCollector): that :func:`start_workers` returned.
+        collector (BaseCollector): that ``start_workers`` returned.
         weights (TensorDictBase): of an :class:`Actor`; nobody else may hold their memory.
         worker (int, optional): its place. Default: all of them.
 
@@ -205,7 +205,7 @@ def why_it_failed(collector: BaseCollector, error: BaseException) -> str:
     """What became of the workers, in one line.
 
     Args:
-        collector (BaseCollector): that :func:`start_workers` returned.
+        collector (BaseCollector): that ``start_workers`` returned.
         error (BaseException): what it raised.
     """
     cause = getattr(error, "cause", None) or error  # of Ray, whose own text is a traceback
