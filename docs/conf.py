@@ -16,6 +16,8 @@ sys.path[:0] = [str(DOCS), str(ROOT / "src")]
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 import generate  # noqa: E402
+from sphinx.util.inspect import signature as signature_of  # noqa: E402
+from sphinx.util.inspect import stringify_signature  # noqa: E402
 
 import torchrl_etdmpc  # noqa: E402
 
@@ -128,6 +130,13 @@ def _plain_code(app, docname, source) -> None:
     source[0] = re.sub(r"```python fragment", "```python", source[0])
 
 
+def _constructor(app, what, name, obj, options, signature, returns):
+    """The arguments of a class whose metaclass hides them."""
+    if what == "class" and signature == "(*args, **kwargs)":
+        return stringify_signature(signature_of(obj.__init__, bound_method=True), show_annotation=False), returns
+    return None
+
+
 def _no_type(app, what, name, obj, options, lines) -> None:
     """Of an attribute's text, what stands before a colon is not a type."""
     if what in ("attribute", "data", "property"):
@@ -138,4 +147,5 @@ def setup(app) -> None:
     warnings.filterwarnings("ignore", message=".*auto_register_policy_transforms.*", category=FutureWarning)
     app.connect("builder-inited", lambda app: generate.write(DOCS / "generated"), priority=1)
     app.connect("source-read", _plain_code)
+    app.connect("autodoc-process-signature", _constructor)
     app.connect("autodoc-process-docstring", _no_type, priority=1)

@@ -1,0 +1,145 @@
+"""
+Reanalyze and per-step replay, by experiment
+============================================
+
+The policy learns from plans that are stored with the transitions. Plans grow old: they were made with weights that have changed
+since. Reanalyze makes some of them anew. This page measures what grows old, and how fast.
+"""
+
+# %%
+# The experiment
+# --------------
+# A small agent acts on Pendulum for 360 decisions, with one update each after the first sixty. Three times: without reanalyze,
+# with one batch in 20 made anew, and with one in 5.
+
+import matplotlib.pyplot as plt
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
+
+from torchrl_etdmpc import (
+    EfficientTDMPCLoss,
+    EnsembleMPPIPlanner,
+    LatentEnv,
+    ReanalyzeTransform,
+    SeedPolicy,
+    StepCollector,
+    StepSliceSampler,
+    WorldModel,
+)
+from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.functional import gaussian_kl
+from torchrl_etdmpc.training import Updater
+
+budget = dict(horizon=3, num_samples=24, num_elites=6, num_proposals=2, iterations=3, discount=0.97)
+
+
+def experiment(interval, insertion="step"):
+    torch.manual_seed(0)
+    env = make_env("gym/Pendulum-v1", seed=0)
+    world_model = WorldModel(3, 1, latent_dim=32, mlp_dim=64, num_dynamics=2)
+    planner = EnsembleMPPIPlanner(LatentEnv(world_model), **budget)
+    fresh = EnsembleMPPIPlanner(LatentEnv(world_model), score="final", warm_start=False, **budget)
+    updater = Updater(EfficientTDMPCLoss(world_model, discount=0.97), lr=1e-3)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1_000),
+        sampler=StepSliceSampler(slice_len=3, as_slices=True),
+        writer=TensorDictRoundRobinWriter(track_generations=True),
+        batch_size=3 * 32,
+    )
+    if interval:
+        ReanalyzeTransform(fresh, slice_len=3, interval=interval, num_slices=8).attach(buffer)
+    collector = StepCollector(
+        env,
+        planner,
+        replay_buffer=buffer,
+        total_frames=360,
+        init_random_frames=60,
+        seed_policy=SeedPolicy(env.action_spec),
+        insertion=insertion,
+    )
+    steps, ages, waiting = [], [], []
+    for frame, _ in enumerate(collector, 1):
+        waiting.append(frame - len(buffer))
+        if frame <= 60 or not len(buffer):
+            continue
+        updater.step(buffer.sample())
+        if frame % 20 == 0:
+            rows = buffer[:]
+            steps.append(frame - 60)
+            ages.append((world_model.version - rows["plan", "version"]).float().mean().item())
+    return buffer[:], world_model, fresh, (steps, ages), waiting
+
+
+results = {interval: experiment(interval) for interval in (0, 20, 5)}
+
+# %%
+# How old plans are
+# -----------------
+# The age of a plan is the number of updates since it was made. Without reanalyze the mean age grows for ever. With it, growth is
+# slower; it stops only where as many plans are made anew as become old.
+
+figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+for interval, (_, _, _, (steps, ages), _) in results.items():
+    axes[0].plot(steps, ages, marker=".", label=f"every {interval} updates" if interval else "never")
+axes[0].set(xlabel="updates", ylabel="mean age of the stored plans, updates")
+axes[0].legend(title="reanalyze")
+
+# %%
+# What goes stale
+# ---------------
+# Every stored state is planned for once more with the final weights. The divergence of the stored plan from that one says how wrong
+# it has become. Two fresh plans of one state differ as well, because planning draws random numbers: the dashed line.
+
+
+def staleness(rows, world_model, fresh):
+    torch.manual_seed(1)
+    again, once_more = (fresh.plan(rows["observation"]) for _ in range(2))
+    stored = rows["plan", "loc"], rows["plan", "scale"]
+    kl = gaussian_kl(again.loc, again.scale, *stored).mean(-1)
+    floor = gaussian_kl(again.loc, again.scale, once_more.loc, once_more.scale).mean(-1)
+    return (world_model.version - rows["plan", "version"]).squeeze(-1), kl, floor
+
+
+rows, world_model, fresh, _, _ = results[20]
+age, kl, floor = staleness(rows, world_model, fresh)
+planned = age < 300  # the random phase stored no plans
+edges = torch.arange(0, 301, 30)
+middles, medians = [], []
+for low, high in zip(edges[:-1], edges[1:], strict=True):
+    chosen = planned & (age >= low) & (age < high)
+    if chosen.sum() >= 5:
+        middles.append(int(low + high) / 2)
+        medians.append(kl[chosen].median().item())
+axes[1].plot(middles, medians, marker="o", label="stored plan")
+axes[1].axhline(floor.median(), color="gray", linestyle="--", label="another fresh plan")
+axes[1].set(xlabel="age of the stored plan, updates", ylabel="KL(fresh || stored), median", yscale="log")
+axes[1].legend()
+plt.show()
+
+# %%
+print(f"{'reanalyze':12} {'mean age':>9} {'median KL of stored plans':>27} {'of fresh ones':>14}")
+for interval, (rows, world_model, fresh, _, _) in results.items():
+    age, kl, floor = staleness(rows, world_model, fresh)
+    chosen = age < 300
+    name = f"every {interval}" if interval else "never"
+    print(f"{name:12} {age.float().mean():9.0f} {kl[chosen].median():27.2f} {floor.median():14.2f}")
+
+# %%
+# Each row of the table is another agent with other data, so compare the columns within a row first.
+#
+# Per step or per episode
+# -----------------------
+# With ``insertion="step"`` a transition can be sampled before the next action is chosen. With ``"episode"`` it waits until its
+# episode has ended, as in BMPC.
+
+_, _, _, _, per_episode = experiment(0, insertion="episode")
+figure, axis = plt.subplots(figsize=(7, 2.8), layout="constrained")
+axis.plot(results[0][4], label='insertion="step"')
+axis.plot(per_episode, label='insertion="episode"')
+axis.set(xlabel="decision", ylabel="transitions that\ncannot be sampled yet")
+axis.legend()
+plt.show()
+
+# %%
+# An episode of 200 decisions means that its newest 200 transitions are unknown to the losses. On tasks where learning is fast, the
+# newest ones matter most.
