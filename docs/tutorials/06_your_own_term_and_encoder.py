@@ -66,7 +66,7 @@ class Reconstruction(nn.Module):
         self.decoder = nn.Sequential(nn.Linear(latent_dim, 64), nn.SiLU(), nn.Linear(64, 3))
 
     def forward(self, world_model, slices, rollout):
-        target = slices.observations[1:] / slices.observations.new_tensor([1.0, 1.0, 8.0])  # [T, B, O]
+        target = slices.next_observation / slices.reward.new_tensor([1.0, 1.0, 8.0])  # [T, B, O]
         decoded = self.decoder(rollout.predicted[1:])  # [T, F, B, O]
         return (decoded - target.unsqueeze(1)).square().mean((1, -1))
 
@@ -76,6 +76,9 @@ class Reconstruction(nn.Module):
 # -------------------
 # The same number of updates with the same data. The policy term is left out (``distill=False``), as random data has no plans.
 # ``Updater`` clips, steps and moves the targets, and it trains the decoder too.
+
+
+KEYS = ("reconstruction_error", "reward_error")
 
 
 def trained(encoder, coef):
@@ -88,9 +91,8 @@ def trained(encoder, coef):
     updater = Updater(loss, lr=1e-3)
     history = []
     for _ in range(300):
-        loss.distill = False
-        history.append(updater.step(buffer.sample()))
-    return {key: [float(terms[key]) for terms in history] for key in ("reconstruction_error", "reward_error")}
+        history.append(updater.step(buffer.sample(), distill=False))
+    return {key: [float(terms[key]) for terms in history] for key in KEYS}
 
 
 torch.manual_seed(0)
@@ -106,7 +108,7 @@ curves = {
 # the scale to compare with.
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-for axis, key in zip(axes, ("reconstruction_error", "reward_error"), strict=True):
+for axis, key in zip(axes, KEYS, strict=True):
     for name, values in curves.items():
         smooth = torch.tensor(values[key]).unfold(0, 20, 1).mean(-1)
         axis.plot(smooth, label=name)
@@ -116,7 +118,7 @@ plt.show()
 
 print(f"{'last 20 updates':30} {'reconstruction_error':>22} {'reward_error':>14}")
 for name, values in curves.items():
-    last = [sum(values[key][-20:]) / 20 for key in ("reconstruction_error", "reward_error")]
+    last = [sum(values[key][-20:]) / 20 for key in KEYS]
     print(f"{name:30} {last[0]:22.4f} {last[1]:14.4f}")
 
 # %%

@@ -19,6 +19,9 @@ class Benchmark:
         tasks (tuple of str): in the order of the thesis' tables.
         budget (int): env steps per run, at which final returns are read and up to which the AUC is taken.
         action_repeat (int): env steps per decision step.
+
+    >>> get_benchmark("dmc-easy").budget
+    200000
     """
 
     name: str

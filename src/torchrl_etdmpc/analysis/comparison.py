@@ -72,6 +72,11 @@ def merge_estimates(seed_curves: pd.DataFrame, means: pd.DataFrame) -> pd.DataFr
     Args:
         seed_curves (DataFrame): ``method, task, seed, env_steps, return_mean``.
         means (DataFrame): estimates.
+
+    >>> runs = pd.DataFrame({"method": "a", "task": "t", "seed": [1, 2], "env_steps": 10, "return_mean": [1.0, 3.0]})
+    >>> means = pd.DataFrame({"method": ["b"], "task": "t", "env_steps": 10, "mean": 5.0, "standard_error": 1.0, "seeds": 3})
+    >>> sorted(merge_estimates(runs, means)["mean"])
+    [2.0, 5.0]
     """
     table = estimate(seed_curves)
     known = set(zip(table["method"], table["task"], strict=True))
@@ -162,6 +167,11 @@ def evaluated_methods(
         means (DataFrame): estimates of baselines that are published as means.
         tasks (sequence of str): the compared tasks.
         budget (float): env steps.
+
+    >>> runs = pd.DataFrame({"method": "a", "task": "t", "seed": 1, "env_steps": [0, 10], "return_mean": 1.0})
+    >>> means = pd.DataFrame({"method": ["b"], "task": "t", "env_steps": 10, "mean": 5.0, "standard_error": 1.0, "seeds": 3})
+    >>> evaluated_methods(runs, means, tasks=["t"], budget=10)
+    ['b', 'a']
     """
     first = begins(merge_estimates(seed_curves, means)).reset_index()
     here = set(first[first["task"].isin(tasks) & (first["env_steps"] <= budget)]["method"])
@@ -173,6 +183,10 @@ def begins(curves: pd.DataFrame) -> pd.Series:
 
     Args:
         curves (DataFrame): seed curves or estimates.
+
+    >>> curves = pd.DataFrame({"method": "a", "task": "t", "env_steps": [0, 10, 20], "mean": 1.0})
+    >>> begins(curves).tolist()
+    [10]
     """
     return curves[curves["env_steps"] > 0].groupby(["method", "task"], sort=False)["env_steps"].min()
 

@@ -42,6 +42,13 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
 
     Raises:
         FileNotFoundError: a path that does not exist, or without a run in or below it.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> (folder / "a" / "seed1").mkdir(parents=True)
+    >>> _ = (folder / "a" / "seed1" / "eval.csv").write_text("")
+    >>> [run.name for run in find_runs([folder])]
+    ['seed1']
     """
     runs: set[Path] = set()
     for path in map(Path, paths):
@@ -194,6 +201,12 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: not a CSV file, missing columns, steps in other units, or two rows for one evaluation.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "curves.csv"
+    >>> _ = file.write_text("method,task,seed,env_steps,return_mean\\nours,walker-walk,1,0,20\\n")
+    >>> read_curves(file)["return_mean"].tolist()
+    [20.0]
     """
     file = Path(file)
     if not file.is_file():
@@ -227,6 +240,12 @@ def read_points(file: str | os.PathLike[str]) -> pd.DataFrame:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: not a CSV file, missing columns or cells, a step of 0, or two rows for one point.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "points.csv"
+    >>> _ = file.write_text("method,task,env_steps,mean,source\\nsome,walker-walk,50000,800,a paper\\n")
+    >>> read_points(file)["mean"].tolist()
+    [800.0]
     """
     file = Path(file)
     if not file.is_file():
@@ -254,6 +273,10 @@ def join_curves(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
 
     Raises:
         ValueError: if two of them hold the same curve: it would count twice.
+
+    >>> curve = {"method": "a", "task": "t", "seed": 1, "env_steps": [0, 10], "return_mean": 1.0}
+    >>> len(join_curves([pd.DataFrame(curve), pd.DataFrame({**curve, "seed": 2})]))
+    4
     """
     seen: set[tuple] = set()
     joined = []

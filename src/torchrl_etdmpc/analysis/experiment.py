@@ -26,6 +26,9 @@ class Experiment:
         seeds (tuple of int): seeds.
         budget (int, optional): env steps of every run. Default: those of the benchmark that a task belongs to.
         base (str, optional): the variant that the others are compared with.
+
+    >>> Experiment(root=Path("runs/utd"), variants=("one", "two"), tasks=("walker-walk",), seeds=(1, 2)).variants
+    ('one', 'two')
     """
 
     root: Path
@@ -50,6 +53,13 @@ def read_experiment(root: Path) -> Experiment:
 
     Raises:
         ValueError: if it does not list them; other keys are ignored.
+
+    >>> import tempfile
+    >>> root = Path(tempfile.mkdtemp())
+    >>> text = "variants: [one, two]\\ntasks: [walker-walk]\\nseeds: [1, 2]\\nbudget: 50000\\n"
+    >>> _ = (root / "experiment.yaml").write_text(text)
+    >>> read_experiment(root).seeds
+    (1, 2)
     """
     file = root / EXPERIMENT
     try:
@@ -75,7 +85,12 @@ def read_experiment(root: Path) -> Experiment:
 
 
 def experiment_root(run: Path) -> Path | None:
-    """The folder above a run that holds an ``experiment.yaml``, if there is one (a task's name may have a slash)."""
+    """The folder above a run that holds an ``experiment.yaml``, if there is one (a task's name may have a slash).
+
+    >>> from pathlib import Path
+    >>> experiment_root(Path("runs/alone")) is None
+    True
+    """
     return next((folder for folder in list(run.parents)[:5] if (folder / EXPERIMENT).is_file()), None)
 
 
@@ -89,6 +104,9 @@ def incomplete_runs(runs: Sequence[Run], experiments: Iterable[Experiment] = ())
     Args:
         runs (sequence of Run): those that were read.
         experiments (iterable of Experiment): of which the runs should be all.
+
+    >>> incomplete_runs([])
+    []
     """
     experiments = list(experiments)
     lines = list(_unfinished(runs, experiments))

@@ -46,6 +46,10 @@ def add_interval(estimates: pd.DataFrame) -> pd.DataFrame:
 
     Args:
         estimates (DataFrame): any number of rows.
+
+    >>> estimates = pd.DataFrame({"mean": [10.0], "standard_error": [1.0], "seeds": [4]})
+    >>> add_interval(estimates)[["std", "lower", "upper"]].values.tolist()
+    [[2.0, 8.04, 11.96]]
     """
     half = Z_95 * estimates["standard_error"]
     return estimates.assign(
@@ -154,6 +158,11 @@ def normalisers(estimates: pd.DataFrame, budget: float, method: str = NORMALISER
 
     Returns:
         Series: index task; without the tasks on which the method has no value at the budget.
+
+    >>> curve = {"method": "BMPC", "task": "t", "seed": 1, "env_steps": [0, 10], "return_mean": [0.0, 500.0]}
+    >>> estimates = seed_estimates(pd.DataFrame(curve))
+    >>> normalisers(estimates, 10)["t"]
+    np.float64(500.0)
     """
     table = interpolate(estimates[estimates["method"] == method], np.array([budget]))
     return table.dropna(subset="mean").set_index("task")["mean"].astype(float)
@@ -167,6 +176,10 @@ def normalise(table: pd.DataFrame, constants: pd.Series) -> pd.DataFrame:
     Args:
         table (DataFrame): estimates, seed curves or areas.
         constants (Series): index task, see :func:`normalisers`.
+
+    >>> table = pd.DataFrame({"method": ["ours"], "task": "t", "env_steps": 10, "mean": 250.0, "standard_error": 50.0})
+    >>> normalise(table, pd.Series({"t": 500.0}))[["mean", "standard_error"]].values.tolist()
+    [[0.5, 0.1]]
     """
     scale = table["task"].map(constants)
     columns = [name for name in ("mean", "standard_error", "return_mean", "auc", "std") if name in table]
@@ -256,6 +269,10 @@ def seed_estimates(seed_curves: pd.DataFrame) -> pd.DataFrame:
 
     Args:
         seed_curves (DataFrame): ``method, task, seed, env_steps, return_mean``; NaN returns are left out.
+
+    >>> curve = {"method": "a", "task": "t", "seed": 1, "env_steps": [0, 10], "return_mean": 1.0}
+    >>> len(seed_estimates(pd.DataFrame(curve)))
+    2
     """
     curves = seed_curves.dropna(subset="return_mean").rename(columns={"return_mean": "mean"})
     return curves.assign(standard_error=np.nan, seeds=1)

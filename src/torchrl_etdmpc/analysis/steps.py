@@ -19,7 +19,11 @@ _COLUMNS = ("env_steps", "method", "task", "mean", "standard_error", "lower", "u
 
 
 def no_points() -> pd.DataFrame:
-    """A table of quoted points without a row."""
+    """A table of quoted points without a row.
+
+    >>> no_points().empty
+    True
+    """
     return pd.DataFrame(
         {name: pd.Series(dtype=float if name in ("env_steps", "mean") else str) for name in POINT_COLUMNS}
     )

@@ -47,6 +47,12 @@ def evaluate(
 
     Raises:
         ValueError: if ``episodes`` is not positive.
+
+    >>> from torchrl.envs import GymEnv, RewardSum, TransformedEnv
+    >>> from torchrl.envs.utils import RandomPolicy
+    >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardSum())
+    >>> evaluate(env, RandomPolicy(env.action_spec), episodes=2).shape
+    torch.Size([2])
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")

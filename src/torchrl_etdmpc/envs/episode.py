@@ -154,6 +154,13 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
 
     Returns:
         dict, optional: tensors only, or ``None`` if the environment cannot be restored.
+
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> env = make_env("gym/Pendulum-v1", seed=0)
+    >>> _ = env.rollout(3)
+    >>> state = simulator_state(env)
+    >>> load_simulator_state(make_env("gym/Pendulum-v1", seed=0), state)
+    True
     """
     simulator = _simulator(env)
     if isinstance(simulator, BatchedEnvBase):

@@ -9,7 +9,12 @@ from torch import Tensor
 
 
 class Gaussian(NamedTuple):
-    """Diagonal Gaussian over action sequences."""
+    """Diagonal Gaussian over action sequences.
+
+    >>> plan = Gaussian(mean=torch.zeros(3, 2), std=torch.ones(3, 2))  # H = 3, A = 2
+    >>> plan.mean.shape
+    torch.Size([3, 2])
+    """
 
     mean: Tensor
     """``[..., H, A]``"""
@@ -18,7 +23,11 @@ class Gaussian(NamedTuple):
 
 
 class Elites(NamedTuple):
-    """The best candidates and their scores, in descending order."""
+    """The best candidates and their scores, in descending order.
+
+    >>> Elites(actions=torch.zeros(8, 3, 2), scores=torch.zeros(8)).scores.shape  # K = 8
+    torch.Size([8])
+    """
 
     actions: Tensor
     """``[..., K, H, A]``"""

@@ -77,7 +77,12 @@ class PredictionModel(Protocol):
 
 @runtime_checkable
 class PolicyModel(PredictionModel, Protocol):
-    """A :class:`PredictionModel` with a policy, which proposes to the planner and can act alone."""
+    """A :class:`PredictionModel` with a policy, which proposes to the planner and can act alone.
+
+    >>> from torchrl_etdmpc.modules import WorldModel
+    >>> isinstance(WorldModel(3, 2, latent_dim=16, mlp_dim=32), PolicyModel)
+    True
+    """
 
     def policy(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of the policy in ``latent [..., L]``, both of shape ``[..., A]``.

@@ -13,7 +13,11 @@ from torchrl_etdmpc.modules import WorldModel
 
 
 class Slices(NamedTuple):
-    """Replayed slices, time first. Fields that a loss does not read are ``None``."""
+    """Replayed slices, time first. Fields that a loss does not read are ``None``.
+
+    >>> Slices(torch.zeros(4, 3), torch.zeros(2, 4, 3), torch.zeros(2, 4, 1), None, None, None, None).action.shape
+    torch.Size([2, 4, 1])
+    """
 
     observation: Any
     """First observation of each slice, ``[B, O]``, or what the encoder takes: a tensor ``[B, ...]`` or a ``TensorDict``
@@ -40,7 +44,12 @@ class Slices(NamedTuple):
 
 
 class LatentRollout(NamedTuple):
-    """Encoded and predicted latents of replayed slices."""
+    """Encoded and predicted latents of replayed slices.
+
+    >>> rollout = LatentRollout(encoded=torch.zeros(4, 8, 16), predicted=torch.zeros(4, 2, 8, 16))
+    >>> (rollout.predicted[1:] - rollout.encoded[1:].unsqueeze(1)).shape  # T = 3, F = 2, B = 8, L = 16
+    torch.Size([3, 2, 8, 16])
+    """
 
     encoded: Tensor
     """Encodings z_0..z_T of the real observations, without gradient, ``[T + 1, B, L]``."""
@@ -63,6 +72,13 @@ def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
 
     Returns:
         LatentRollout: ``[T + 1, B, L]`` and ``[T + 1, F, B, L]``.
+
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32, num_dynamics=2)
+    >>> slices = EfficientTDMPCLoss(world_model, discount=0.99).slices(random_slices(3, 2, num_slices=4, slice_len=3))
+    >>> latent_rollout(world_model, slices).predicted.shape
+    torch.Size([4, 2, 4, 16])
     """
     first = world_model.encode(slices.observation)
     with torch.no_grad():

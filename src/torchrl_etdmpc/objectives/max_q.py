@@ -17,7 +17,14 @@ from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Term
 
 
 class PolicyValue(NamedTuple):
-    """What a policy's actions are worth, and how spread they are."""
+    """What a policy's actions are worth, and how spread they are.
+
+    >>> from torchrl_etdmpc.modules import ActionValueWorldModel
+    >>> world_model = ActionValueWorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> found = policy_value(world_model, torch.zeros(4, 16), torch.zeros(4, 2), torch.tensor([0, 1]))
+    >>> found.entropy.shape
+    torch.Size([4])
+    """
 
     value: Tensor
     """Of a sampled action, ``[...]``."""
@@ -49,6 +56,11 @@ def policy_value(
 
     Returns:
         PolicyValue: value and entropy, each ``[...]``.
+
+    >>> from torchrl_etdmpc.modules import ActionValueWorldModel
+    >>> world_model = ActionValueWorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> policy_value(world_model, torch.zeros(4, 16), torch.zeros(4, 2), torch.tensor([0, 1])).value.shape
+    torch.Size([4])
     """
     latent = latent.detach()
     mean, log_std = world_model.policy.before_tanh(latent)

@@ -160,6 +160,12 @@ class LatentRolloutLoss(LossModule):
     Raises:
         TypeError: if a term is not a :class:`Term`.
         ValueError: if an argument is out of range, or two names of terms, coefficients or metrics are the same.
+
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> loss = EfficientTDMPCModelLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
+    >>> loss(random_slices(3, 2))["loss_reward"].shape
+    torch.Size([])
     """
 
     # TorchRL sums every entry that starts with "loss_" (its Trainer does, and so do users), so the entries must carry

@@ -38,6 +38,11 @@ def imagined_value_target(
 
     Returns:
         Tensor: targets in the units of the return, without gradient, shape ``[...]``.
+
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> latent = world_model.encode(torch.zeros(4, 3))
+    >>> imagined_value_target(world_model, world_model.values, latent, torch.randn(4, 2), 0.99).shape
+    torch.Size([4])
     """
     action = world_model.act(latent, noise)
     imagined = world_model.next(latent.unsqueeze(0), action)
@@ -59,6 +64,11 @@ def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor,
 
     Returns:
         Tensor: mean over value and dynamics heads, shape ``[T, B]``.
+
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> rollout = LatentRollout(torch.zeros(4, 5, 16), torch.zeros(4, world_model.num_dynamics, 5, 16))
+    >>> value_error(world_model, rollout, torch.zeros(3, 5), dropout=False).shape
+    torch.Size([3, 5])
     """
     heads = world_model.num_dynamics
     logits = world_model.value_head(head_rows(rollout.predicted[:-1]), dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
@@ -77,6 +87,11 @@ def td_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor) ->
 
     Returns:
         Tensor: without gradient and dropout, shape ``[T, B]``.
+
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)  # new values are 0
+    >>> rollout = LatentRollout(torch.zeros(3, 1, 16), torch.zeros(3, world_model.num_dynamics, 1, 16))
+    >>> td_error(world_model, rollout, torch.full((2, 1), 5.0)).round().tolist()
+    [[5.0], [5.0]]
     """
     heads = world_model.num_dynamics
     values = world_model.values(head_rows(rollout.predicted[:-1]))

@@ -21,6 +21,10 @@ def consistency_error(rollout: LatentRollout) -> Tensor:
 
     Returns:
         Tensor: mean over latent dimensions and heads, shape ``[T, B]``.
+
+    >>> import torch
+    >>> consistency_error(LatentRollout(torch.zeros(3, 4, 16), torch.ones(3, 2, 4, 16))).tolist()
+    [[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0]]
     """
     return (rollout.predicted[1:] - rollout.encoded[1:].unsqueeze(1)).square().mean(-1).mean(1)
 
@@ -37,6 +41,14 @@ def reward_error(world_model: WorldModel, rollout: LatentRollout, slices: Slices
 
     Returns:
         Tensor: mean over heads, shape ``[T, B]``.
+
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+    >>> from torchrl_etdmpc.objectives.latent_rollout import latent_rollout
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> slices = EfficientTDMPCLoss(world_model, discount=0.99).slices(random_slices(3, 2))
+    >>> reward_error(world_model, latent_rollout(world_model, slices), slices).shape
+    torch.Size([3, 4])
     """
     assert slices.reward is not None
     heads = world_model.num_dynamics
@@ -55,6 +67,14 @@ def termination_error(world_model: WorldModel, rollout: LatentRollout, slices: S
 
     Returns:
         Tensor: mean over heads, shape ``[T, B]``.
+
+    >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
+    >>> from torchrl_etdmpc.objectives.latent_rollout import latent_rollout
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32, termination=True)
+    >>> slices = EfficientTDMPCLoss(world_model, discount=0.99).slices(random_slices(3, 2, terminated=True))
+    >>> termination_error(world_model, latent_rollout(world_model, slices), slices).shape
+    torch.Size([3, 4])
     """
     assert world_model.termination_head is not None and slices.terminated is not None
     logits = world_model.termination_head(rollout.predicted[1:])

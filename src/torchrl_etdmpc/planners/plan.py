@@ -8,7 +8,14 @@ from torch import Tensor
 
 
 class PlanNoise(NamedTuple):
-    """Every random number of one planning call."""
+    """Every random number of one planning call.
+
+    >>> from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), horizon=3, num_samples=32, num_elites=8, num_proposals=4)
+    >>> planner.draw_noise(5).candidates.shape  # of five states
+    torch.Size([5, 6, 28, 3, 1])
+    """
 
     proposals: Tensor
     """Standard normal, ``[..., P, H, A]``."""
@@ -26,7 +33,15 @@ class PlanNoise(NamedTuple):
 
 
 class PlanTrace(NamedTuple):
-    """Every iteration of a planning call, for inspection."""
+    """Every iteration of a planning call, for inspection.
+
+    >>> import torch
+    >>> from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), horizon=3, num_samples=32, num_elites=8, num_proposals=4)
+    >>> planner.plan(torch.zeros(5, 1), trace=True).trace.scores.shape
+    torch.Size([5, 6, 32])
+    """
 
     actions: Tensor
     """Candidates, the policy's proposals first, ``[..., I, N, H, A]``."""
@@ -41,7 +56,16 @@ class PlanTrace(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Result of a planning call."""
+    """Result of a planning call.
+
+    >>> import torch
+    >>> from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), horizon=3, num_samples=32, num_elites=8, num_proposals=4)
+    >>> plan = planner.plan(torch.zeros(5, 1))
+    >>> plan.action.shape, plan.mean.shape, plan.trace
+    (torch.Size([5, 1]), torch.Size([5, 3, 1]), None)
+    """
 
     action: Tensor
     """Action to take: a sample in training, ``loc`` in evaluation, ``[..., A]``."""

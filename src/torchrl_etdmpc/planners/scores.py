@@ -28,6 +28,9 @@ class Score(Protocol):
     """Reduces a return table, and says how much of it the planner has to compute.
 
     :func:`make_score` makes one of any function.
+
+    >>> isinstance(FinalScore(), Score), isinstance(lambda returns: returns.mean((-3, -2, -1)), Score)
+    (True, False)
     """
 
     @property

@@ -26,6 +26,8 @@ def require_logger(name: LoggerName) -> None:
     Raises:
         ValueError: if there is none of that name.
         ImportError: if its package is not installed.
+
+    >>> require_logger("none")
     """
     if name not in get_args(LoggerName):
         raise ValueError(f"logger must be one of {', '.join(get_args(LoggerName))}, got {name!r}.")

@@ -33,6 +33,10 @@ class AnalyticWorld(nn.Module):
 
     Raises:
         ValueError: if the errors of the heads have another shape.
+
+    >>> world = LineWorld(num_dynamics=2, drift=torch.tensor([[0.1], [-0.1]]))
+    >>> isinstance(world, AnalyticWorld), world.encode(torch.zeros(1)).shape
+    (True, torch.Size([2]))
     """
 
     drift: Tensor

@@ -78,6 +78,9 @@ def build_world_model(
 
     Keyword Args:
         terminates (bool): whether the task's episodes can end before their time limit. Default: ``False``.
+
+    >>> build_world_model(ModelConfig(latent_dim=16, mlp_dim=32), observation_dim=3, action_dim=2).num_dynamics
+    4
     """
     termination = terminates if config.termination is None else config.termination
     sizes = arguments(config, "termination", "action_values")

@@ -169,7 +169,11 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A whole run. Steps that users see are environment steps; one decision is ``action_repeat`` of them."""
+    """A whole run. Steps that users see are environment steps; one decision is ``action_repeat`` of them.
+
+    >>> TrainConfig(task="gym/Pendulum-v1", total_env_steps=10_000).seed_decisions
+    1000
+    """
 
     task: str = "walker-walk"
     """A task of DMC or HumanoidBench, gym/ID for one of Gymnasium, or module:function for your own."""
@@ -375,6 +379,9 @@ def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> 
 
     Raises:
         ValueError: if a key is unknown, or a value has the wrong type or is out of range.
+
+    >>> config_from_dict(OptimConfig, {"lr": 1e-3}).lr
+    0.001
     """
     hints = _type_hints(cls)
     unknown = sorted(set(values) - set(hints))

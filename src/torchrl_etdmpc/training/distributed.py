@@ -29,7 +29,11 @@ WEIGHT_AGE = "weight_age"
 
 @dataclass(frozen=True)
 class DistributedConfig(TrainConfig):
-    """A run whose decisions are made by workers; see :class:`WorkerCollector`."""
+    """A run whose decisions are made by workers; see :class:`WorkerCollector`.
+
+    >>> DistributedConfig(task="gym/Pendulum-v1", workers=2).num_envs
+    1
+    """
 
     workers: int = 2
     """Processes that plan and step, one environment each."""
