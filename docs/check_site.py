@@ -3,8 +3,8 @@
     python docs/check_site.py build/docs/html [--screenshots FOLDER]
 
 Every page, at 390 and 1280 pixels: nothing on the console, no request to another host, every image there, nothing wider
-than the window, every link within the site leads somewhere, and a block of code is copied by its button. The API pages hold
-every public name. Without a Chromium it says so and checks names and links alone.
+than the window, every link within the site leads somewhere, and a block of code is copied by its button. The API pages
+hold every public name. Without a Chromium it says so and checks names and links alone.
 """
 
 from __future__ import annotations
@@ -120,11 +120,13 @@ def _chromium() -> str | None:
 
 LOOK = """
 const wide = document.documentElement.scrollWidth - window.innerWidth;
-const images = [...document.images].filter(image => !image.complete || image.naturalWidth === 0).map(image => image.src);
+const missing = image => !image.complete || image.naturalWidth === 0;
+const images = [...document.images].filter(missing).map(image => image.src);
 let widest = '';
 if (wide > 0) {
   for (const element of document.querySelectorAll('article *')) {
-    if (element.getBoundingClientRect().right > window.innerWidth + 1 && !element.closest('.table-wrapper, pre, .formula'))
+    const right = element.getBoundingClientRect().right;
+    if (right > window.innerWidth + 1 && !element.closest('.table-wrapper, pre, .formula'))
       { widest = element.tagName + '.' + element.className + ' ' + element.textContent.slice(0, 40); break; }
   }
 }

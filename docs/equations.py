@@ -1,4 +1,4 @@
-"""Which function computes which equation, and which tests hold it; ``tests/docs/test_site_parts.py`` checks the names."""
+"""Which function computes which equation, and which tests hold it; ``tests/test_site.py`` checks the names."""
 
 from __future__ import annotations
 

@@ -2,16 +2,16 @@
 First run and its curves
 ========================
 
-A run is a configuration and a folder. This page trains Gymnasium's Pendulum for a few minutes of its time and reads what the
-run wrote.
+A run is a configuration and a folder. This page trains Gymnasium's Pendulum for a few minutes of its time and reads
+what the run wrote.
 """
 
 # %%
 # The configuration
 # -----------------
-# A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` is the full method at a size that one core
-# learns with. On the command line the same is
-# ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu total_env_steps=1600 ...``.
+# A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` is the full method at a size that
+# one core learns with. On the command line the same is ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu
+# total_env_steps=1200 ...``.
 
 import tempfile
 from dataclasses import replace
@@ -27,7 +27,7 @@ small = preset("cpu")
 config = replace(
     small,
     task="gym/Pendulum-v1",
-    total_env_steps=1_600,
+    total_env_steps=1_200,
     eval_every=400,
     eval_episodes=3,
     log_every=100,
@@ -39,27 +39,30 @@ config = replace(
 # %%
 # The run
 # -------
-# ``launch`` trains to the end and returns one line on what came out. Before its first step it says how long it will take.
-# A random agent has a return near -1,200 here; a good one has about -150.
+# ``launch`` trains to the end and returns one line on what came out. Before its first step it says how long it will
+# take. A random agent has a return near -1,200 here; a good one has about -150.
 
 print(launch(config))
 
 # %%
 # What it wrote
 # -------------
-# ``eval.csv`` has a row per evaluation, played with the planner and without noise. Every evaluation plays the same episodes.
+# ``eval.csv`` has a row per evaluation, played with the planner and without noise. Every evaluation plays the same
+# episodes.
 
 print(sorted(path.name for path in run_dir.iterdir()))
 evaluations = pd.read_csv(run_dir / "eval.csv")
 print(evaluations[["env_steps", "updates", "wall_time_s", "return_mean", "return_std"]].round(1).to_string(index=False))
 
 # %%
-# ``train.csv`` has a row per interval of training: losses and what they are made of, gradients, the age of the plans that the
-# policy learns from.
+# ``train.csv`` has a row per interval of training: losses and what they are made of, gradients, the age of the plans
+# that the policy learns from.
 
 training = pd.read_csv(run_dir / "train.csv")
 figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), layout="constrained")
-axes[0, 0].errorbar(evaluations["env_steps"], evaluations["return_mean"], evaluations["return_std"], marker="o", capsize=3)
+axes[0, 0].errorbar(
+    evaluations["env_steps"], evaluations["return_mean"], evaluations["return_std"], marker="o", capsize=3
+)
 axes[0, 0].set(title="return, with the standard deviation of 3 episodes")
 for axis, column in zip(axes.flat[1:], ("reward_error", "consistency_error", "target_age"), strict=True):
     axis.plot(training["env_steps"], training[column], marker=".")
@@ -71,8 +74,9 @@ plt.show()
 # %%
 # How to read it
 # --------------
-# The dotted errors fall while the world model learns from random actions. The return rises once plans are good enough to bring
-# the pendulum up. ``target_age`` grows with the buffer: plans are made anew now and then, but not all of them.
+# The dotted errors fall while the world model learns from random actions. The return rises once plans are good enough
+# to bring the pendulum up. ``target_age`` grows with the buffer: plans are made anew now and then, but not all of
+# them.
 #
 # One seed of a small run shows that it learns, and not how well: for that see `the expected curves
 # <../start.html#expected-curves>`_.

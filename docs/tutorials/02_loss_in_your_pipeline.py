@@ -2,8 +2,8 @@
 The loss in a TorchRL pipeline of your own
 ==========================================
 
-``EfficientTDMPCLoss`` is a TorchRL loss module. Here it learns Pendulum with TorchRL's ``GymEnv``, ``Collector`` and replay buffer
-and a plain Adam; nothing of this package's training code is used.
+``EfficientTDMPCLoss`` is a TorchRL loss module. Here it learns Pendulum with TorchRL's ``GymEnv``, ``Collector`` and
+replay buffer and a plain Adam; nothing of this package's training code is used.
 """
 
 # %%
@@ -34,8 +34,8 @@ world_model = WorldModel(observation_dim=3, action_dim=1, latent_dim=32, mlp_dim
 # %%
 # Planner, loss, buffer
 # ---------------------
-# The planner acts. A second one, without a warm start, makes old plans anew. The loss takes slices of three steps of one
-# episode, ``[B, T]``, which the sampler cuts from the buffer as soon as they are there.
+# The planner acts. A second one, without a warm start, makes old plans anew. The loss takes slices of three steps of
+# one episode, ``[B, T]``, which the sampler cuts from the buffer as soon as they are there.
 
 budget = dict(horizon=3, num_samples=32, num_elites=6, num_proposals=2, iterations=3, discount=0.97)
 planner = EnsembleMPPIPlanner(LatentEnv(world_model), score="mean", **budget)
@@ -54,10 +54,11 @@ ReanalyzeTransform(reanalyzer, slice_len=3, interval=10, num_slices=4).attach(bu
 # %%
 # The loop
 # --------
-# An episode is collected, then there is one update for each of its steps. ``loss(batch)`` returns the weighted terms, whose names
-# begin with ``loss_``, and metrics.
+# An episode is collected, then there is one update for each of its steps. ``loss(batch)`` returns the weighted terms,
+# whose names begin with ``loss_``, and metrics.
 
-collector = Collector(env, planner, frames_per_batch=200, total_frames=1_600, auto_register_policy_transforms=True)
+collector = Collector(env, planner, frames_per_batch=200, total_frames=1_400, auto_register_policy_transforms=True)
+ERRORS = ("consistency_error", "reward_error", "value_error", "policy_kl")
 returns, errors = [], []
 for frames in collector:
     buffer.extend(frames.exclude("plan_mean", ("next", "plan_mean")))  # the warm start need not be stored
@@ -69,13 +70,14 @@ for frames in collector:
         optimizer.zero_grad()
         target_update.step()
     returns.append(frames["next", "reward"].sum().item())
-    errors.append({key: terms[key].item() for key in ("consistency_error", "reward_error", "value_error", "policy_kl")})
+    errors.append({key: terms[key].item() for key in ERRORS})
 
 # %%
 # Shapes, for those who look them up: what goes in, and what comes out.
 
 batch = buffer.sample()
-print("in: ", {str(key): tuple(batch[key].shape) for key in ("observation", "action", ("next", "reward"), ("plan", "loc"))})
+entries = ("observation", "action", ("next", "reward"), ("plan", "loc"))
+print("in: ", {str(key): tuple(batch[key].shape) for key in entries})
 print("out:", {key: tuple(value.shape) for key, value in terms.items()})
 
 # %%
@@ -93,5 +95,6 @@ axes[1].legend()
 plt.show()
 
 # %%
-# These are training episodes, with exploration, of one seed. The first ones are played with random weights: there is no random
-# phase here. What else works in the place of ``Collector`` and the buffer is in `the table of pipelines <../pipelines.html>`_.
+# These are training episodes, with exploration, of one seed. The first ones are played with random weights: there is
+# no random phase here. What else works in the place of ``Collector`` and the buffer is in `the table of pipelines
+# <../pipelines.html>`_.

@@ -2,15 +2,15 @@
 The planner on a world whose best plan is known
 ===============================================
 
-The planner needs a model that encodes, predicts and values. Here it gets one that is exact, so that its plans can be held
-against the optimum. Then it gets a model of your own.
+The planner needs a model that encodes, predicts and values. Here it gets one that is exact, so that its plans can be
+held against the optimum. Then it gets a model of your own.
 """
 
 # %%
 # A point on a line
 # -----------------
-# ``LineWorld`` is a point whose action is its speed; the reward is highest at the origin. It offers the same methods as a
-# learned world model, so ``LatentEnv`` wraps it in the same way.
+# ``LineWorld`` is a point whose action is its speed; the reward is highest at the origin. It offers the same methods
+# as a learned world model, so ``LatentEnv`` wraps it in the same way.
 
 import matplotlib.pyplot as plt
 import torch
@@ -28,8 +28,8 @@ print("planned:", [round(action, 2) for action in plan.action.flatten().tolist()
 print("optimal:", [round(action, 2) for action in world.optimal_action(states).flatten().tolist()])
 
 # %%
-# One call planned for nine states at once. ``plan.trace`` holds every iteration: the candidates, their scores, the mean and
-# the standard deviation. The search begins wide and closes in on the optimum.
+# One call planned for nine states at once. ``plan.trace`` holds every iteration: the candidates, their scores, the
+# mean and the standard deviation. The search begins wide and closes in on the optimum.
 
 optimum = world.optimal_actions(states, 3)
 error = (plan.trace.mean - optimum.unsqueeze(-3)).abs().mean((-2, -1))  # [states, iterations]
@@ -47,8 +47,8 @@ plt.show()
 # %%
 # A model of your own
 # -------------------
-# Any module with these members can be planned over; `the page on models <../models.html>`_ lists what each means. This one is a
-# pendulum in closed form: the latent is the angle and its speed, and the reward asks it to stand up.
+# Any module with these members can be planned over; `the page on models <../models.html>`_ lists what each means.
+# This one is a pendulum in closed form: the latent is the angle and its speed, and the reward asks it to stand up.
 
 
 class Pendulum(torch.nn.Module):
@@ -76,8 +76,8 @@ class Pendulum(torch.nn.Module):
 
 
 # %%
-# There is no policy and no value, so the horizon has to see the whole swing: 30 steps of 50 ms. The plan is carried from step
-# to step, as TD-MPC2 does.
+# There is no policy and no value, so the horizon has to see the whole swing: 30 steps of 50 ms. The plan is carried
+# from step to step, as TD-MPC2 does.
 
 model = Pendulum()
 planner = EnsembleMPPIPlanner(
@@ -102,5 +102,5 @@ axes[1].set(ylabel="action", xlabel="decision")
 plt.show()
 
 # %%
-# With an exact model the planner alone is enough. What the learned parts add is a value, so that a horizon of three will do, and
-# proposals, so that few candidates will do.
+# With an exact model the planner alone is enough. What the learned parts add is a value, so that a horizon of three
+# will do, and proposals, so that few candidates will do.

@@ -2,15 +2,16 @@
 A planner objective of your own
 ===============================
 
-The planner scores a candidate by a function of its table of return estimates. You can pass a function of yours. To compare
-objectives, plan with each from the same states, with the same random numbers, and judge the plans by a world that is known.
+The planner scores a candidate by a function of its table of return estimates. You can pass a function of yours. To
+compare objectives, plan with each from the same states, with the same random numbers, and judge the plans by a world
+that is known.
 """
 
 # %%
 # A world with a trap
 # -------------------
-# In ``LineWorld`` a point has to go to its goal. One of four dynamics heads believes that actions between 0.2 and 0.6 earn a
-# large bonus. That is what a learned model's mistake looks like to a planner: an opportunity.
+# In ``LineWorld`` a point has to go to its goal. One of four dynamics heads believes that actions between 0.2 and 0.6
+# earn a large bonus. That is what a learned model's mistake looks like to a planner: an opportunity.
 
 import matplotlib.pyplot as plt
 import torch
@@ -24,7 +25,8 @@ truth = LineWorld(goal=-1.0)
 # %%
 # Objectives are functions
 # ------------------------
-# The table is ``[..., D, F, V]``: depth, dynamics head, value head. A score reduces it to ``[...]``. Here are two of your own.
+# The table is ``[..., D, F, V]``: depth, dynamics head, value head. A score reduces it to ``[...]``. Here are two of
+# your own.
 
 
 def cautious(returns):
@@ -50,7 +52,8 @@ scores = {
 # %%
 # The same states, the same draws
 # -------------------------------
-# ``draw_noise`` draws every random number of a planning call. With the same ones, two plans differ by the objective alone.
+# ``draw_noise`` draws every random number of a planning call. With the same ones, two plans differ by the objective
+# alone.
 
 budget = dict(horizon=3, num_samples=128, num_elites=16, num_proposals=0, iterations=6, warm_start=False)
 states = torch.linspace(-2, 1, 64).unsqueeze(-1)
@@ -77,6 +80,6 @@ axis.set(xlabel="reward lost per step against the optimum", title="64 states, sa
 plt.show()
 
 # %%
-# What this shows is the mechanism: where one head is wrong and the others are not, disagreement gives it away. It does not show
-# that caution pays while learning. There, heads disagree about everything that is new, and a cautious agent may never go and
-# see.
+# What this shows is the mechanism: where one head is wrong and the others are not, disagreement gives it away. It
+# does not show that caution pays while learning. There, heads disagree about everything that is new, and a cautious
+# agent may never go and see.

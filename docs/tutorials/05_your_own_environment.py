@@ -2,15 +2,16 @@
 Your own environment, and one that terminates
 =============================================
 
-Any TorchRL environment can be trained on. This page writes one from nothing, lets ``check_env`` say what it lacks, and gives it an
-edge that ends the episode.
+Any TorchRL environment can be trained on. This page writes one from nothing, lets ``check_env`` say what it lacks,
+and gives it an edge that ends the episode.
 """
 
 # %%
 # An environment from nothing
 # ---------------------------
-# A cart on a track: the action pushes it, and the reward is highest at the right edge. Whoever goes over an edge has *terminated*:
-# nothing follows. After 50 steps time is up and the episode is *truncated*: something would have followed.
+# A cart on a track: the action pushes it, and the reward is highest at the right edge. Whoever goes over an edge has
+# *terminated*: nothing follows. After 50 steps time is up and the episode is *truncated*: something would have
+# followed.
 
 import tempfile
 from pathlib import Path
@@ -70,8 +71,8 @@ except ValueError as error:
     print(error)
 
 # %%
-# ``make_env`` adds these two by itself. A task is a name, a time limit and whether episodes can terminate; ``register_task`` makes
-# it known, with its maker.
+# ``make_env`` adds these two by itself. A task is a name, a time limit and whether episodes can terminate;
+# ``register_task`` makes it known, with its maker.
 
 task = Task("track", "mine", episode_length=50, terminates=True)
 register_task(task, lambda task, device: Track(device))
@@ -82,8 +83,8 @@ check_env(make_env(task, seed=0))
 #
 # Training
 # --------
-# The world model gets a termination head because the task terminates, and slices may begin in an episode's last steps, so that ends
-# are learned from as often as other steps.
+# The world model gets a termination head because the task terminates, and slices may begin in an episode's last
+# steps, so that ends are learned from as often as other steps.
 
 run_dir = Path(tempfile.mkdtemp()) / "track"
 planner = {"horizon": 3, "num_samples": 32, "num_elites": 6, "num_proposals": 2, "iterations": 3}
@@ -104,8 +105,8 @@ print(launch(config).rpartition(";")[0])
 # %%
 # Does it know the edges?
 # -----------------------
-# The head predicts, from the latent that an action leads to, whether the episode has ended. Here it is asked for positions on both
-# sides of the edges, at three speeds. What the agent never visits it cannot know.
+# The head predicts, from the latent that an action leads to, whether the episode has ended. Here it is asked for
+# positions on both sides of the edges, at three speeds. What the agent never visits it cannot know.
 
 agent, _, _ = load_agent(run_dir / "checkpoints" / "last.pt")
 positions = torch.linspace(-1.2, 1.2, 121)

@@ -2,15 +2,15 @@
 Your own loss term and encoder
 ==============================
 
-The loss is a list of terms, and you can add to it. The encoder is a module, and you can replace it. Here an encoder normalises its
-input by itself, and a term asks latents to remember the observation.
+The loss is a list of terms, and you can add to it. The encoder is a module, and you can replace it. Here an encoder
+normalises its input by itself, and a term asks latents to remember the observation.
 """
 
 # %%
 # Data
 # ----
-# Pendulum's observation is the cosine and the sine of an angle, and a speed up to 8. Two thousand random steps are enough to see
-# what changes.
+# Pendulum's observation is the cosine and the sine of an angle, and a speed up to 8. Two thousand random steps are
+# enough to see what changes.
 
 import matplotlib.pyplot as plt
 import torch
@@ -35,8 +35,8 @@ for frames in Collector(env, RandomPolicy(env.action_spec), frames_per_batch=500
 # %%
 # An encoder
 # ----------
-# It takes an observation with any leading batch and returns latents ``[..., L]``. Predicted latents lie in the range of SimNorm, so
-# it ends with ``simnorm``.
+# It takes an observation with any leading batch and returns latents ``[..., L]``. Predicted latents lie in the range
+# of SimNorm, so it ends with ``simnorm``.
 
 
 class ScaledEncoder(nn.Module):
@@ -53,9 +53,9 @@ class ScaledEncoder(nn.Module):
 # %%
 # A term
 # ------
-# A term is a function of world model, slices and their latent rollout that returns an error of every step, ``[T, B]``. One that is
-# a module brings networks of its own, which the loss owns, saves and trains. This one reads the real next observation from
-# each head's predicted latent.
+# A term is a function of world model, slices and their latent rollout that returns an error of every step, ``[T,
+# B]``. One that is a module brings networks of its own, which the loss owns, saves and trains. This one reads the
+# real next observation from each head's predicted latent.
 
 
 class Reconstruction(nn.Module):
@@ -74,8 +74,8 @@ class Reconstruction(nn.Module):
 # %%
 # Three ways to train
 # -------------------
-# The same number of updates with the same data. The policy term is left out (``distill=False``), as random data has no plans.
-# ``Updater`` clips, steps and moves the targets, and it trains the decoder too.
+# The same number of updates with the same data. The policy term is left out (``distill=False``), as random data has
+# no plans. ``Updater`` clips, steps and moves the targets, and it trains the decoder too.
 
 
 KEYS = ("reconstruction_error", "reward_error")
@@ -104,8 +104,8 @@ curves = {
 }
 
 # %%
-# Without weight the term is computed and trains nothing, so its error is that of a decoder that was never trained: the first line is
-# the scale to compare with.
+# Without weight the term is computed and trains nothing, so its error is that of a decoder that was never trained:
+# the first line is the scale to compare with.
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for axis, key in zip(axes, KEYS, strict=True):
@@ -122,5 +122,5 @@ for name, values in curves.items():
     print(f"{name:30} {last[0]:22.4f} {last[1]:14.4f}")
 
 # %%
-# Latents can hold the observation if they are asked to. Whether that helps an agent is another question, which this page does not
-# answer: the method does without, on purpose, so that latents hold what rewards and values need.
+# Latents can hold the observation if they are asked to. Whether that helps an agent is another question, which this
+# page does not answer: the method does without, on purpose, so that latents hold what rewards and values need.

@@ -2,15 +2,15 @@
 Reanalyze and per-step replay, by experiment
 ============================================
 
-The policy learns from plans that are stored with the transitions. Plans grow old: they were made with weights that have changed
-since. Reanalyze makes some of them anew. This page measures what grows old, and how fast.
+The policy learns from plans that are stored with the transitions. Plans grow old: they were made with weights that
+have changed since. Reanalyze makes some of them anew. This page measures what grows old, and how fast.
 """
 
 # %%
 # The experiment
 # --------------
-# A small agent acts on Pendulum for 360 decisions, with one update each after the first sixty. Three times: without reanalyze,
-# with one batch in 20 made anew, and with one in 5.
+# A small agent acts on Pendulum for 360 decisions, with one update each after the first sixty. Three times: without
+# reanalyze, with one batch in 20 made anew, and with one in 5.
 
 import matplotlib.pyplot as plt
 import torch
@@ -75,8 +75,8 @@ results = {interval: experiment(interval) for interval in (0, 20, 5)}
 # %%
 # How old plans are
 # -----------------
-# The age of a plan is the number of updates since it was made. Without reanalyze the mean age grows for ever. With it, growth is
-# slower; it stops only where as many plans are made anew as become old.
+# The age of a plan is the number of updates since it was made. Without reanalyze the mean age grows for ever. With
+# it, growth is slower; it stops only where as many plans are made anew as become old.
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
 for interval, (_, _, _, (steps, ages), _) in results.items():
@@ -87,8 +87,9 @@ axes[0].legend(title="reanalyze")
 # %%
 # What goes stale
 # ---------------
-# Every stored state is planned for once more with the final weights. The divergence of the stored plan from that one says how wrong
-# it has become. Two fresh plans of one state differ as well, because planning draws random numbers: the dashed line.
+# Every stored state is planned for once more with the final weights. The divergence of the stored plan from that one
+# says how wrong it has become. Two fresh plans of one state differ as well, because planning draws random numbers:
+# the dashed line.
 
 
 def staleness(rows, world_model, fresh):
@@ -129,8 +130,8 @@ for interval, (rows, world_model, fresh, _, _) in results.items():
 #
 # Per step or per episode
 # -----------------------
-# With ``insertion="step"`` a transition can be sampled before the next action is chosen. With ``"episode"`` it waits until its
-# episode has ended, as in BMPC.
+# With ``insertion="step"`` a transition can be sampled before the next action is chosen. With ``"episode"`` it waits
+# until its episode has ended, as in BMPC.
 
 _, _, _, _, per_episode = experiment(0, insertion="episode")
 figure, axis = plt.subplots(figsize=(7, 2.8), layout="constrained")
@@ -141,5 +142,5 @@ axis.legend()
 plt.show()
 
 # %%
-# An episode of 200 decisions means that its newest 200 transitions are unknown to the losses. On tasks where learning is fast, the
-# newest ones matter most.
+# An episode of 200 decisions means that its newest 200 transitions are unknown to the losses. On tasks where learning
+# is fast, the newest ones matter most.

@@ -2,15 +2,15 @@
 Inspect a plan
 ==============
 
-With ``trace=True`` a plan brings every iteration with it: candidates, scores, return tables, the mean and the standard deviation.
-This page looks at one decision in slow motion.
+With ``trace=True`` a plan brings every iteration with it: candidates, scores, return tables, the mean and the
+standard deviation. This page looks at one decision in slow motion.
 """
 
 # %%
 # One decision, two objectives
 # ----------------------------
-# The world is the one of the tutorial on objectives: one of four heads believes in a bonus for actions between 0.2 and 0.6, and
-# the goal lies the other way.
+# The world is the one of the tutorial on objectives: one of four heads believes in a bonus for actions between 0.2
+# and 0.6, and the goal lies the other way.
 
 import matplotlib.pyplot as plt
 import torch
@@ -33,8 +33,8 @@ print({name: tuple(value.shape) for name, value in trace._asdict().items()})
 # %%
 # Candidates and scores, iteration by iteration
 # ---------------------------------------------
-# Each dot is a candidate: its first action, and its score. Those in colour are the elites, to which the next Gaussian is
-# fitted.
+# Each dot is a candidate: its first action, and its score. Those in colour are the elites, to which the next Gaussian
+# is fitted.
 
 figure, axes = plt.subplots(2, 4, figsize=(11, 5), sharex=True, sharey="row", layout="constrained")
 for row, (beta, plan) in zip(axes, plans.items(), strict=True):
@@ -52,13 +52,13 @@ for axis in axes[-1]:
 plt.show()
 
 # %%
-# Without a penalty the bonus of one head lifts the mean, and the search closes in on the trap (red). With it, the same candidates
-# fall behind.
+# Without a penalty the bonus of one head lifts the mean, and the search closes in on the trap (red). With it, the
+# same candidates fall behind.
 #
 # The table behind a score
 # ------------------------
-# For the best candidate of the first iteration: a row for each depth, a column for each head. The head that is wrong stands
-# alone.
+# For the best candidate of the first iteration: a row for each depth, a column for each head. The head that is wrong
+# stands alone.
 
 best = trace.scores[0].argmax()
 table = trace.returns[0, best].squeeze(-1)
@@ -76,7 +76,7 @@ plt.show()
 # %%
 # Of a trained agent
 # ------------------
-# The same call works with a learned model: ``load_agent`` of ``torchrl_etdmpc.training`` reads a checkpoint's agent, and
-# ``agent.eval_planner.plan(observations, explore=False, trace=True)`` traces it. There is no truth to hold the plan against
-# then, but three things are worth a look: whether the spread shrinks, whether elites come from the policy's proposals (the
-# first ones of ``trace.actions``), and at which depth the heads begin to disagree.
+# The same call works with a learned model: ``load_agent`` of ``torchrl_etdmpc.training`` reads a checkpoint's agent,
+# and ``agent.eval_planner.plan(observations, explore=False, trace=True)`` traces it. There is no truth to hold the
+# plan against then, but three things are worth a look: whether the spread shrinks, whether elites come from the
+# policy's proposals (the first ones of ``trace.actions``), and at which depth the heads begin to disagree.

@@ -2,8 +2,8 @@
 Interrupt a run and go on
 =========================
 
-A run that is stopped at any moment goes on from its newest checkpoint as if nothing had happened. Here one run is left alone, and
-a second one is stopped by a signal and goes on. Then the two are compared, digit by digit.
+A run that is stopped at any moment goes on from its newest checkpoint as if nothing had happened. Here one run is
+left alone, and a second one is stopped by a signal and goes on. Then the two are compared, digit by digit.
 """
 
 # %%
@@ -56,8 +56,8 @@ print(launch(config("left alone")).rpartition(";")[0])
 # %%
 # Stopped in the middle
 # ---------------------
-# A thread waits until the second run has written some rows and then sends SIGTERM, as a cluster would. The run finishes its
-# step, saves, and raises ``RunInterrupted``; a command exits with 75 then.
+# A thread waits until the second run has written some rows and then sends SIGTERM, as a cluster would. The run
+# finishes its step, saves, and raises ``RunInterrupted``; a command exits with 75 then.
 
 
 def stop_when(table, rows):
@@ -77,8 +77,8 @@ except RunInterrupted as interruption:
 # %%
 # And on
 # ------
-# ``resume="auto"`` goes on if there is something to go on from, and begins otherwise: a job script can always run the same
-# command.
+# ``resume="auto"`` goes on if there is something to go on from, and begins otherwise: a job script can always run the
+# same command.
 
 print(launch(config("stopped", resume="auto")).rpartition(";")[0])
 
@@ -95,7 +95,9 @@ print(f"evaluations equal to the last digit: {same}")
 print(f"final weights equal to the last bit: {equal}")
 
 figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-axis.plot(runs["left alone"]["env_steps"], runs["left alone"]["return_mean"], linewidth=6, alpha=0.3, label="left alone")
+axis.plot(
+    runs["left alone"]["env_steps"], runs["left alone"]["return_mean"], linewidth=6, alpha=0.3, label="left alone"
+)
 axis.plot(runs["stopped"]["env_steps"], runs["stopped"]["return_mean"], marker="o", label="stopped, gone on")
 axis.axvline(stopped_at, color="gray", linestyle=":", label=f"stopped after {stopped_at} env steps")
 axis.set(xlabel="env steps", ylabel="return")

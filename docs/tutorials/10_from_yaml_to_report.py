@@ -2,15 +2,15 @@
 A small experiment, from YAML to report
 =======================================
 
-A comparison is tasks, seeds and variants. This page writes one into a file, trains its runs with one command, and makes a report
-with another.
+A comparison is tasks, seeds and variants. This page writes one into a file, trains its runs with one command, and
+makes a report with another.
 """
 
 # %%
 # The file
 # --------
-# Two variants that differ by one setting: whether old plans are made anew. The networks are tiny and the budget is small, so
-# that four runs fit into a minute.
+# Two variants that differ by one setting: whether old plans are made anew. The networks are tiny and the budget is
+# small, so that four runs fit into a minute.
 
 import subprocess
 import sys
@@ -64,7 +64,8 @@ for line in command("suite", "experiment=reanalyze.yaml", "dry_run=true").splitl
 # %%
 # All runs
 # --------
-# Typed again, the same command would find everything finished. ``suite status`` can be asked from elsewhere meanwhile.
+# Typed again, the same command would find everything finished. ``suite status`` can be asked from elsewhere
+# meanwhile.
 
 command("suite", "experiment=reanalyze.yaml", "runs_dir=runs", "workers=2")
 print(command("suite", "status", "runs_dir=runs"))
@@ -86,5 +87,5 @@ axis.axis("off")
 plt.show()
 
 # %%
-# Two seeds and 800 env steps answer nothing: the intervals are as wide as the curves. For an answer raise ``seeds`` and
-# ``budget`` in the file and run it again; what is finished is not repeated when seeds are added.
+# Two seeds and 800 env steps answer nothing: the intervals are as wide as the curves. For an answer raise ``seeds``
+# and ``budget`` in the file and run it again; what is finished is not repeated when seeds are added.

@@ -74,7 +74,8 @@ def merge_estimates(seed_curves: pd.DataFrame, means: pd.DataFrame) -> pd.DataFr
         means (DataFrame): estimates.
 
     >>> runs = pd.DataFrame({"method": "a", "task": "t", "seed": [1, 2], "env_steps": 10, "return_mean": [1.0, 3.0]})
-    >>> means = pd.DataFrame({"method": ["b"], "task": "t", "env_steps": 10, "mean": 5.0, "standard_error": 1.0, "seeds": 3})
+    >>> mean = {"mean": 5.0, "standard_error": 1.0, "seeds": 3}
+    >>> means = pd.DataFrame({"method": ["b"], "task": "t", "env_steps": 10, **mean})
     >>> sorted(merge_estimates(runs, means)["mean"])
     [2.0, 5.0]
     """
@@ -169,7 +170,8 @@ def evaluated_methods(
         budget (float): env steps.
 
     >>> runs = pd.DataFrame({"method": "a", "task": "t", "seed": 1, "env_steps": [0, 10], "return_mean": 1.0})
-    >>> means = pd.DataFrame({"method": ["b"], "task": "t", "env_steps": 10, "mean": 5.0, "standard_error": 1.0, "seeds": 3})
+    >>> mean = {"mean": 5.0, "standard_error": 1.0, "seeds": 3}
+    >>> means = pd.DataFrame({"method": ["b"], "task": "t", "env_steps": 10, **mean})
     >>> evaluated_methods(runs, means, tasks=["t"], budget=10)
     ['b', 'a']
     """

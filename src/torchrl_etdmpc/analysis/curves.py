@@ -204,7 +204,8 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "curves.csv"
-    >>> _ = file.write_text("method,task,seed,env_steps,return_mean\\nours,walker-walk,1,0,20\\n")
+    >>> rows = ["method,task,seed,env_steps,return_mean", "ours,walker-walk,1,0,20"]
+    >>> _ = file.write_text(os.linesep.join(rows))
     >>> read_curves(file)["return_mean"].tolist()
     [20.0]
     """
@@ -243,7 +244,8 @@ def read_points(file: str | os.PathLike[str]) -> pd.DataFrame:
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "points.csv"
-    >>> _ = file.write_text("method,task,env_steps,mean,source\\nsome,walker-walk,50000,800,a paper\\n")
+    >>> rows = ["method,task,env_steps,mean,source", "some,walker-walk,50000,800,a paper"]
+    >>> _ = file.write_text(os.linesep.join(rows))
     >>> read_points(file)["mean"].tolist()
     [800.0]
     """

@@ -56,7 +56,7 @@ def read_experiment(root: Path) -> Experiment:
 
     >>> import tempfile
     >>> root = Path(tempfile.mkdtemp())
-    >>> text = "variants: [one, two]\\ntasks: [walker-walk]\\nseeds: [1, 2]\\nbudget: 50000\\n"
+    >>> text = "{variants: [one, two], tasks: [walker-walk], seeds: [1, 2], budget: 50000}"
     >>> _ = (root / "experiment.yaml").write_text(text)
     >>> read_experiment(root).seeds
     (1, 2)
