@@ -72,6 +72,9 @@ class Run:
         seed (int): its seed.
         finished (bool): whether it reached its budget.
         curve (DataFrame): seed curve, see :func:`read_run`.
+
+    >>> Run(Path("runs/a/seed1"), "ours", "walker-walk", 1, True, pd.DataFrame()).method
+    'ours'
     """
 
     path: Path
@@ -113,6 +116,14 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
     Raises:
         FileNotFoundError: a file is missing.
         ValueError: a file is not what it should be, or counts steps in other units.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = (folder / "config.yaml").write_text("{task: walker-walk, preset: cpu, seed: 1}")
+    >>> rows = ["env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes", "0,0,0,1,20,1,10", ""]
+    >>> _ = (folder / "eval.csv").write_text(os.linesep.join(rows))
+    >>> read_run(folder)["return_mean"].tolist()
+    [20.0]
     """
     return Run.read(run_dir, method=method).curve
 
@@ -163,6 +174,17 @@ def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = N
     Raises:
         FileNotFoundError: no run in one of the paths.
         ValueError: two runs of the same method, task and seed, or a file that cannot be read.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> rows = ["env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes", "0,0,0,1,20,1,10", ""]
+    >>> for seed in (1, 2):
+    ...     run = folder / f"seed{seed}"
+    ...     run.mkdir()
+    ...     _ = (run / "config.yaml").write_text(f"{{task: walker-walk, preset: cpu, seed: {seed}}}")
+    ...     _ = (run / "eval.csv").write_text(os.linesep.join(rows))
+    >>> read_runs([folder])["seed"].tolist()
+    [1, 2]
     """
     return join_runs([Run.read(run_dir, method=method) for run_dir in find_runs(paths)])
 
@@ -172,6 +194,10 @@ def join_runs(runs: Iterable[Run]) -> pd.DataFrame:
 
     Raises:
         ValueError: two runs of the same method, task and seed.
+
+    >>> curve = {"method": "ours", "task": "walker-walk", "seed": 1, "env_steps": [0, 10], "return_mean": 1.0}
+    >>> len(join_runs([Run(Path("a"), "ours", "walker-walk", 1, True, pd.DataFrame(curve))]))
+    2
     """
     tables, seen = [], {}
     for run in runs:

@@ -75,6 +75,14 @@ def plot_run(run_dir: str | os.PathLike[str]) -> Path:
     Raises:
         FileNotFoundError: if it has not evaluated, or does not say what was trained.
         ValueError: if no evaluation has a finite return.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = (folder / "config.yaml").write_text("{task: walker-walk, preset: cpu, seed: 1}")
+    >>> rows = ["env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes", "0,0,0,1,20,1,10", ""]
+    >>> _ = (folder / "eval.csv").write_text(os.linesep.join(rows))
+    >>> plot_run(folder).name
+    'curve.png'
     """
     directory, header, table = RunDirectory(run_dir), read_header(run_dir), read_evaluations(run_dir)
     mean = table["return_mean"]
@@ -115,6 +123,12 @@ def plot_curves(
         methods (sequence of str): in the order of the legend.
         budget (float): right end of the axis, env steps.
         points (DataFrame, optional): quoted means, drawn as hollow markers that no line joins.
+
+    >>> estimates = pd.DataFrame({"method": "ours", "task": "walker-walk", "env_steps": [0, 10, 20], "mean": 1.0})
+    >>> estimates = estimates.assign(standard_error=0.1, seeds=3)
+    >>> figure = plot_curves(estimates, tasks=["walker-walk"], methods=["ours"], budget=20)
+    >>> [axis.get_title() for axis in figure.axes]
+    ['walker-walk']
     """
     points = no_points() if points is None else points[points["task"].isin(tasks) & (points["env_steps"] <= budget)]
     quoted = list(dict.fromkeys(points["method"]))

@@ -257,6 +257,11 @@ def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray, *, from_zero
 
     Returns:
         DataFrame: ``method, task, standard_error``.
+
+    >>> curve = {"method": "a", "task": "t", "env_steps": [10, 20]}
+    >>> curves = pd.concat([pd.DataFrame({**curve, "seed": seed, "return_mean": 1.0}) for seed in (1, 2)])
+    >>> auc_standard_error(curves, np.array([10, 20]))["standard_error"].tolist()
+    [0.0]
     """
     areas = auc(interpolate(seed_estimates(seed_curves), grid, from_zero=from_zero))
     groups = areas.groupby(["method", "task"], sort=False)["auc"]

@@ -22,6 +22,10 @@ def result_table(values: pd.DataFrame, *, tasks: Sequence[str], methods: Sequenc
 
     Returns:
         DataFrame: index ``task``, columns ``methods``, NaN where a value is unavailable.
+
+    >>> values = pd.DataFrame({"method": ["a", "b"], "task": "t", "mean": [1.0, 2.0]})
+    >>> result_table(values, tasks=["t"], methods=["b", "a"], column="mean").values.tolist()
+    [[2.0, 1.0], [nan, nan]]
     """
     wide = values.pivot(index="task", columns="method", values=column)
     return wide.reindex(index=[*tasks, AGGREGATE], columns=list(methods))
@@ -51,6 +55,10 @@ def to_csv(table: pd.DataFrame, seeds: pd.DataFrame, errors: pd.DataFrame) -> st
         table (DataFrame): see :func:`result_table`.
         seeds (DataFrame): of the same shape.
         errors (DataFrame): of the same shape.
+
+    >>> table = pd.DataFrame({"a": [1.0], "b": [2.0]}, index=pd.Index(["t"], name="task"))
+    >>> to_csv(table, table, table).splitlines()[1].split(",")[:5]
+    ['t', '1', '2', 'b', 'a']
     """
     parts = [table, rank_methods(table)]
     parts += [errors.add_suffix(" standard_error"), seeds.add_suffix(" seeds")]
@@ -64,6 +72,10 @@ def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, i
         table (DataFrame): see :func:`result_table`; a dash marks an unavailable value.
         seeds (DataFrame): of the same shape; a question mark stands for an unknown number.
         digits (int or dict): decimals, of every row or by task.
+
+    >>> table = pd.DataFrame({"a": [1.0], "b": [2.0]}, index=pd.Index(["t"], name="task"))
+    >>> print(to_markdown(table, table, digits=1).splitlines()[-1])
+    | t | *1.0* (1) | **2.0** (2) |
     """
     ranks = rank_methods(table)
     names = [str(name).replace("|", "\\|") for name in table.columns]

@@ -53,6 +53,12 @@ def action_value_target(
 
     Returns:
         Tensor: targets in the units of the return, without gradient, ``[...]``.
+
+    >>> world_model = ActionValueWorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> latent, reward, heads = world_model.encode(torch.zeros(4, 3)), torch.ones(4), torch.tensor([0, 3])
+    >>> values = world_model.action_values  # new ones are 0, so that the reward is left
+    >>> action_value_target(world_model, values, latent, reward, None, torch.randn(4, 2), heads, 0.99).round().tolist()
+    [1.0, 1.0, 1.0, 1.0]
     """
     bootstrap = target_values(latent, world_model.act(latent, noise)).index_select(-1, heads).amin(-1)
     if terminated is not None:
@@ -74,6 +80,15 @@ def action_value_error(
 
     Returns:
         Tensor: mean over value and dynamics heads, ``[T, B]``.
+
+    >>> from torchrl_etdmpc.objectives import TDMPC2Loss
+    >>> from torchrl_etdmpc.objectives.latent_rollout import latent_rollout
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> world_model = ActionValueWorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> slices = TDMPC2Loss(world_model, discount=0.99).slices(random_slices(3, 2))
+    >>> rollout = latent_rollout(world_model, slices)
+    >>> action_value_error(world_model, rollout, slices, torch.zeros(3, 4), dropout=False).shape
+    torch.Size([3, 4])
     """
     heads = world_model.num_dynamics
     rows = head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads)
@@ -86,7 +101,16 @@ def action_value_error(
 def action_td_error(
     world_model: ActionValueWorldModel, rollout: LatentRollout, slices: Slices, target: Tensor
 ) -> Tensor:
-    """Distance of the action values from their targets, ``mean_{i,j} |Q_j(zhat_{k,i}, a_k) - y_k|``, ``[T, B]``."""
+    """Distance of the action values from their targets, ``mean_{i,j} |Q_j(zhat_{k,i}, a_k) - y_k|``, ``[T, B]``.
+
+    >>> from torchrl_etdmpc.objectives import TDMPC2Loss
+    >>> from torchrl_etdmpc.objectives.latent_rollout import latent_rollout
+    >>> from torchrl_etdmpc.testing import random_slices
+    >>> world_model = ActionValueWorldModel(3, 2, latent_dim=16, mlp_dim=32)
+    >>> slices = TDMPC2Loss(world_model, discount=0.99).slices(random_slices(3, 2))
+    >>> action_td_error(world_model, latent_rollout(world_model, slices), slices, torch.zeros(3, 4)).shape
+    torch.Size([3, 4])
+    """
     heads = world_model.num_dynamics
     values = world_model.action_values(head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads))
     return mean_of_head_rows((values - head_rows(target, heads).unsqueeze(-1)).abs().mean(-1), heads)

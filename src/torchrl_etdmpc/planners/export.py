@@ -84,6 +84,13 @@ def export_planner(
 
     Raises:
         ValueError: if ``batch_size`` is below 1, or an example is needed.
+
+    >>> from torchrl_etdmpc import LatentEnv, WorldModel
+    >>> budget = {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1}
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(WorldModel(3, 1, latent_dim=16, mlp_dim=32)), **budget)
+    >>> action, plan_mean = export_planner(planner).module()(torch.zeros(1, 3), torch.zeros(1, 2, 1))
+    >>> action.shape, plan_mean.shape
+    (torch.Size([1, 1]), torch.Size([1, 2, 1]))
     """
     if batch_size is not None and batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}.")

@@ -53,6 +53,9 @@ def make_logger(name: LoggerName, directory: RunDirectory, config: Mapping[str, 
     Raises:
         ValueError: if there is none of that name.
         ImportError: if its package is not installed.
+
+    >>> make_logger("none", RunDirectory("runs/a"), {}) is None
+    True
     """
     require_logger(name)
     if name == "none":

@@ -46,6 +46,11 @@ class Run:
         seed (int): its seed.
         path (Path): its run directory.
         config (TrainConfig): all of its settings.
+
+    >>> experiment = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> (run,) = experiment.runs(Path("runs/heads"))
+    >>> str(run.path), run.config.total_env_steps
+    ('runs/heads/cpu/walker-walk/seed1', 50000)
     """
 
     variant: str
@@ -73,6 +78,9 @@ class Search:
 
     Raises:
         ValueError: if the space is empty, or an entry is neither.
+
+    >>> Search({"optim.lr": {"low": 1e-4, "high": 3e-3, "log": True}}, trials=20).prune
+    True
     """
 
     space: Mapping[str, Any]
@@ -121,6 +129,11 @@ class Experiment:
 
     Raises:
         ValueError: if something is missing, doubled or of the wrong kind; the message names the entry.
+
+    >>> heads = {"one": {"model.num_dynamics": 1}, "two": {"model.num_dynamics": 2}}
+    >>> experiment = Experiment("heads", ("walker-walk",), (1, 2), heads, settings={"preset": "cpu"}, budget=50_000)
+    >>> [f"{run.variant} {run.seed}" for run in experiment.runs(Path("runs/heads"))]
+    ['one 1', 'one 2', 'two 1', 'two 2']
     """
 
     name: str
@@ -247,6 +260,13 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
     Raises:
         ValueError: if the file cannot be read, or says what it may not. It may hold the path of a task or a score of
             one's own, but only the command line can make this process follow it.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "mine.yaml"
+    >>> _ = file.write_text("{tasks: [walker-walk], seeds: 2, budget: 50000, variants: {cpu: {preset: cpu}}}")
+    >>> experiment = read_experiment(file, seeds=3)
+    >>> experiment.name, experiment.seeds
+    ('mine', (1, 2, 3))
     """
     try:
         values = yaml.load(read_whole(file, _FILE_BYTES), _Loader)
@@ -283,6 +303,12 @@ def find_experiment(name: str, folder: Path) -> Path:
 
     Raises:
         ValueError: if there is none; the message holds the nearest names.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = (folder / "mine.yaml").write_text("")
+    >>> find_experiment("mine", folder).name
+    'mine.yaml'
     """
     if name.endswith((".yaml", ".yml")):
         path = Path(name).expanduser()
@@ -305,6 +331,11 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
 
     Raises:
         ValueError: if a run that belongs to both would train with other settings; the message names the first.
+
+    >>> stored = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> asked = Experiment("heads", ("walker-walk",), (1, 2), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> extended(stored, asked, Path("runs/heads")).seeds
+    (1, 2)
     """
     for name, search in asked.searches.items():
         before = dataclasses.replace(stored.searches.get(name, search), trials=search.trials, prune=search.prune)
@@ -336,7 +367,14 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
 
 
 def write_experiment(experiment: Experiment, file: Path) -> None:
-    """Writes what :func:`read_experiment` reads, whole or not at all."""
+    """Writes what :func:`read_experiment` reads, whole or not at all.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "experiment.yaml"
+    >>> write_experiment(Experiment("heads", ("walker-walk",), (1, 2), {"cpu": {"preset": "cpu"}}), file)
+    >>> read_experiment(file).seeds
+    (1, 2)
+    """
     write_whole(file, yaml.safe_dump(experiment.to_dict(), sort_keys=False, allow_unicode=True))
 
 

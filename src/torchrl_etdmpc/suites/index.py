@@ -33,6 +33,9 @@ class Progress:
         latest_return (float): of its last evaluation; NaN before the first one.
         decisions_per_second (float): lately; NaN if not known.
         error (str): the last line of a failed run, or why it was pruned.
+
+    >>> Progress("running", env_steps=20_000).latest_return
+    nan
     """
 
     state: State
@@ -43,7 +46,15 @@ class Progress:
 
 
 def read_progress(run: Run) -> Progress:
-    """How far a run is, from its directory alone; a damaged file counts as missing."""
+    """How far a run is, from its directory alone; a damaged file counts as missing.
+
+    >>> from pathlib import Path
+    >>> from torchrl_etdmpc.suites import Experiment
+    >>> experiment = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> (run,) = experiment.runs(Path("runs/nowhere"))
+    >>> read_progress(run).state
+    'waiting'
+    """
     directory = RunDirectory(run.path)
     evals, rows = last_rows(directory.eval), last_rows(directory.train)
     latest = number_of(evals[-1], "return_mean") if evals else math.nan
@@ -70,6 +81,13 @@ class RunIndex:
 
     Args:
         file (Path): an SQLite file.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.suites import Experiment
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> experiment = Experiment("heads", ("walker-walk",), (1, 2), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> [progress.state for progress in RunIndex(folder / "index.sqlite").read(experiment.runs(folder))]
+    ['waiting', 'waiting']
     """
 
     def __init__(self, file: Path) -> None:

@@ -74,6 +74,13 @@ class RunQueue:
 
     Attributes:
         runs (list of Run): all that it ever had.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from torchrl_etdmpc.suites import Experiment
+    >>> experiment = Experiment("heads", ("walker-walk",), (1, 2), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> RunQueue(experiment.runs(Path(tempfile.mkdtemp()))).next().seed
+    1
     """
 
     def __init__(

@@ -20,6 +20,13 @@ def status_text(runs: Sequence[Run], progress: Sequence[Progress], workers: int 
         runs (sequence of Run): those of an experiment.
         progress (sequence of Progress): of each.
         workers (int): runs at a time while none is running, for the time that is left. Default: ``1``.
+
+    >>> from pathlib import Path
+    >>> from torchrl_etdmpc.suites import Experiment, read_progress
+    >>> experiment = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> runs = experiment.runs(Path("runs/nowhere"))
+    >>> print(status_text(runs, [read_progress(run) for run in runs]).splitlines()[0].split()[:2])
+    ['variant', 'task']
     """
     groups: dict[tuple[str, str], list[tuple[Run, Progress]]] = {}
     for run, how_far in zip(runs, progress, strict=True):

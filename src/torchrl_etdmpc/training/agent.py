@@ -27,7 +27,13 @@ from torchrl_etdmpc.training.updater import Updater
 
 @dataclass(frozen=True)
 class Agent:
-    """The parts that learn and act; all of them share one world model, or its average where weights are averaged."""
+    """The parts that learn and act; all of them share one world model, or its average where weights are averaged.
+
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> agent.planner.world_model is agent.loss.world_model
+    True
+    """
 
     world_model: WorldModel
     planner: EnsembleMPPIPlanner
@@ -157,6 +163,10 @@ def build_agent(
 
     Raises:
         ValueError: if a setting is out of range; the text begins with its name.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> build_agent(preset("cpu"), observation_dim=3, action_dim=1).planner.horizon
+    3
     """
     device, task = torch.device(device), config.task_spec
     compile_mode = resolve_compile(config.compile, device, config.total_decisions - config.seed_decisions)

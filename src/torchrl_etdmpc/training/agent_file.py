@@ -118,6 +118,12 @@ def save_agent(path: str | Path, agent: Agent, config: TrainConfig, counters: Ma
 
     Returns:
         Path: the file.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> save_agent(Path(tempfile.mkdtemp()) / "agent.pt", agent, preset("cpu"), {"env_steps": 0}).name
+    'agent.pt'
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -130,6 +136,13 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
 
     Raises:
         CheckpointError: if the file is missing, is not an agent file or has another format.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> file = save_agent(Path(tempfile.mkdtemp()) / "agent.pt", agent, preset("cpu"), {"env_steps": 0})
+    >>> read_agent_file(file)["observation_dim"]
+    3
     """
     path = Path(path).expanduser()
     if not path.exists() or path.is_dir():
@@ -186,6 +199,15 @@ def load_agent(
 
     Raises:
         CheckpointError: if the file cannot be used, or the sizes differ.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> counters = {"env_steps": 0, "decision_steps": 0, "updates": 0, "wall_time_s": 0.0}
+    >>> file = save_agent(Path(tempfile.mkdtemp()) / "agent.pt", agent, preset("cpu"), counters)
+    >>> loaded, config, _ = load_agent(file)
+    >>> loaded.planner.horizon, config.preset
+    (3, 'cpu')
     """
     content = read_agent_file(path)
     saved = (content["observation_dim"], content["action_dim"])

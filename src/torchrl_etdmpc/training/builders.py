@@ -107,7 +107,14 @@ def build_replay(
 
 
 def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayBuffer) -> ReanalyzeTransform | None:
-    """Reanalyze attached to the buffer, or ``None`` if ``reanalyze.every`` is 0."""
+    """Reanalyze attached to the buffer, or ``None`` if ``reanalyze.every`` is 0.
+
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> config = preset("cpu")
+    >>> agent = build_agent(config, observation_dim=3, action_dim=1)
+    >>> build_reanalyze(config, agent, build_replay(config)).interval
+    10
+    """
     if config.reanalyze.every == 0:
         return None
     # Departure from the thesis, which can be read as an interval of gradient updates: of decision steps, so that "UTD1

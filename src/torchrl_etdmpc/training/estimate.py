@@ -30,7 +30,12 @@ def decision_flops(config: TrainConfig) -> tuple[float, float]:
 
 
 def estimated_seconds(config: TrainConfig) -> float:
-    """Seconds of the whole run on the CPU, without compilation; right within a factor of two or three."""
+    """Seconds of the whole run on the CPU, without compilation; right within a factor of two or three.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> 10 < estimated_seconds(preset("cpu")) < 100_000
+    True
+    """
     plan, rest = decision_flops(config)
     speed = _SHARE_OF_SPEED * _flops_per_second(config)
     repeat = config.task_spec.action_repeat
@@ -53,6 +58,10 @@ def what_it_takes(config: TrainConfig, device: torch.device, env_steps: int = 0,
         device (torch.device): its device.
         env_steps (int): what it has behind it, if it goes on. Default: 0.
         compiled (bool): whether anything is compiled. Default: ``True``.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> "on this CPU" in what_it_takes(preset("cpu"), torch.device("cpu"))
+    True
     """
     if device.type == "cuda":
         return f"on {torch.cuda.get_device_name(device)}"

@@ -51,6 +51,10 @@ class Launch:
         directory (RunDirectory): of the run.
         action (str): ``"begin"`` a new run, also where one ended before its first step; ``"resume"`` from the newest
             checkpoint; ``"nothing"`` to do, it is finished.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> Launch(preset("cpu"), RunDirectory("runs/a"), "begin").action
+    'begin'
     """
 
     config: TrainConfig
@@ -70,6 +74,13 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
         FileNotFoundError: if there is no run to go on with and ``resume`` is on, or a run with results has no
             checkpoint to go on from.
         ValueError: if the command names a setting with another value than the run's, and it may not change.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.training import preset
+    >>> run_dir = Path(tempfile.mkdtemp()) / "run"
+    >>> from dataclasses import replace
+    >>> plan_launch(replace(preset("cpu"), run_dir=str(run_dir))).action
+    'begin'
     """
     directory = _directory(config.to_dict())
     there = directory.config.exists() or directory.last_agent.exists()
@@ -175,6 +186,13 @@ def read_run_config(directory: RunDirectory, kind: type[TrainConfig] = TrainConf
     Raises:
         FileNotFoundError: if there is none.
         ValueError: if it is not a configuration of this version.
+
+    >>> import tempfile
+    >>> directory = RunDirectory(Path(tempfile.mkdtemp()) / "run")
+    >>> directory.begin(TrainConfig(task="walker-walk", preset="cpu", seed=3).to_dict())
+    >>> read_run_config(directory).seed
+    3
+    >>> directory.close()
     """
     try:
         values = directory.read_config()
@@ -212,6 +230,9 @@ def with_stored_settings(
 
     Raises:
         ValueError: as :func:`resumed_config` does.
+
+    >>> with_stored_settings({"task": "walker-walk", "preset": "cpu", "seed": 1, "resume": "off"})["preset"]
+    'cpu'
     """
     directory, resume = _directory(values), values.get("resume", "off")
     there = directory.config.exists() or directory.last_agent.exists()
@@ -237,6 +258,10 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
 
     Raises:
         ValueError: if the command names a setting with another value than the run's, and it may not change.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> resumed_config(preset("cpu"), {"total_env_steps": 100_000}, ["total_env_steps"]).total_env_steps
+    100000
     """
     values = _flat(saved.to_dict())
     wanted = _flat(asked.to_dict() if isinstance(asked, TrainConfig) else asked)

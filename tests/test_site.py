@@ -1,0 +1,146 @@
+"""What the site is made of agrees with the code; `make docs` builds it."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+# Public names without an example yet. A name that gets one is taken off; nothing is added.
+WITHOUT_EXAMPLE = {
+    "training.Agent",
+}
+
+
+@pytest.fixture(scope="module")
+def generate():
+    pytest.importorskip("hydra")
+    sys.path.insert(0, str(DOCS))
+    try:
+        yield importlib.import_module("generate")
+    finally:
+        sys.path.remove(str(DOCS))
+
+
+def documented(room: str) -> list[tuple[str, object]]:
+    """Classes and functions, but for errors, which are raised and not called."""
+    module = importlib.import_module(f"torchrl_etdmpc.{room}")
+    things = [(name, getattr(module, name)) for name in module.__all__]
+    callables = [(name, thing) for name, thing in things if getattr(thing, "__module__", "").startswith("torchrl_etdmpc")]
+    return [
+        (name, thing) for name, thing in callables if not (inspect.isclass(thing) and issubclass(thing, BaseException))
+    ]
+
+
+def test_every_room_of_the_package_has_a_page(generate):
+    rooms = {path.parent.name for path in (ROOT / "src" / "torchrl_etdmpc").glob("*/__init__.py")}
+    assert set(generate.ROOMS) == rooms
+
+
+def test_every_public_name_is_documented_with_a_text(generate):
+    for room in generate.ROOMS:
+        page = generate.api_page(room)
+        module = importlib.import_module(f"torchrl_etdmpc.{room}")
+        for name in module.__all__:
+            assert re.search(rf"(\.|:: |``){name}\b", page), f"{room}.{name} is on no page"
+            thing = getattr(module, name)
+            routine = inspect.isclass(thing) or inspect.isroutine(thing) or hasattr(thing, "cache_info")
+            assert thing.__doc__ if routine else generate.data_doc(room, name), f"{room}.{name} has no docstring"
+
+
+def test_every_public_name_has_an_example(generate):
+    missing = {
+        f"{room}.{name}"
+        for room in generate.ROOMS
+        for name, thing in documented(room)
+        if ">>>" not in (thing.__doc__ or "")
+    }
+    assert missing == WITHOUT_EXAMPLE
+
+
+def test_the_equations_name_functions_and_tests_that_exist(generate):
+    for equation in generate.EQUATIONS:
+        module, _, name = equation.function.rpartition(".")
+        assert name in importlib.import_module(module).__all__, equation.function
+        for test in equation.tests:
+            file, _, function = test.partition("::")
+            text = (ROOT / file).read_text(encoding="utf-8")
+            assert not function or f"def {function}(" in text, test
+
+
+def test_the_equations_of_the_thesis_that_docstrings_name_are_in_the_table(generate):
+    text = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    named = set(re.findall(r"thesis Eq\. (\d\.\d+)", text, re.I))
+    tabled = {equation.source.removeprefix("thesis Eq. ") for equation in generate.EQUATIONS}
+    assert named - tabled == set()
+
+
+def test_the_figure_of_the_data_flow_is_that_of_its_text(generate):
+    sys.path.insert(0, str(DOCS / "figures"))
+    try:
+        data_flow = importlib.import_module("data_flow")
+    finally:
+        sys.path.remove(str(DOCS / "figures"))
+    drawn = data_flow.SVG.read_text(encoding="utf-8")
+    assert data_flow.digest() in drawn, "the figure is older than its text; run python docs/figures/data_flow.py"
+
+
+def test_the_table_of_settings_has_every_setting_and_the_presets_that_differ(generate):
+    text = generate.configuration()
+    for name in generate.settings_of(generate.TrainConfig):
+        assert f"| `{name}` |" in text
+    (row,) = (line for line in text.splitlines() if line.startswith("| `planner.horizon` |"))
+    assert "`6`" in row and "`3` in bmpc, tdmpc2, cpu, tdmpc2-cpu" in row
+
+
+def test_a_setting_without_a_meaning_is_noticed(generate):
+    settings = generate.settings_of(generate.TrainConfig)
+    assert [name for name, setting in settings.items() if not setting.meaning] == []
+
+
+def test_the_expected_curves_are_those_of_the_committed_runs(generate):
+    text = generate.curves()
+    (row,) = (line for line in text.splitlines() if line.startswith("| walker-walk | 3 |"))
+    assert " 822 [578, 969] |" in row  # as benchmarks/results/cpu/README.md has it
+    assert "| walker-walk | 60,000 | 12.5 to 16.7 | 36 to 52 |" in text
+
+
+def test_the_ranges_of_the_markers_are_those_of_the_file(generate):
+    text = generate.markers()
+    assert "| `plan_fallbacks` | 0 to 0 |" in text
+    assert len(text.splitlines()) > 10
+
+
+def test_the_commands_explain_themselves(generate):
+    text = generate.commands()
+    for command in generate.COMMANDS:
+        assert command == "train_dmc" or re.search(rf"## `{command}`\n\n```text\n\w", text), command
+
+
+def test_names_in_the_text_of_pages_are_settings(generate):
+    known = set(generate.settings_of(generate.TrainConfig)) | set(generate.settings_of(generate.DistributedConfig))
+    known.add("planner.compiled_plan")  # an attribute, in a table of contracts
+    groups = "|".join(generate.groups_of(generate.TrainConfig))
+    for page in DOCS.rglob("*.md"):
+        if "generated" in page.parts or "gallery" in page.parts:
+            continue
+        for name in re.findall(rf"`((?:{groups})\.\w+)[`=]", page.read_text(encoding="utf-8")):
+            assert name in known, f"{page.name} names {name}"
+
+
+def test_dead_links_and_undocumented_names_of_a_built_site_are_found(tmp_path):
+    sys.path.insert(0, str(DOCS))
+    try:
+        check_site = importlib.import_module("check_site")
+    finally:
+        sys.path.remove(str(DOCS))
+    (tmp_path / "a.html").write_text('<a href="b.html#here">x</a> <a href="gone.html">y</a> <img src="no.png">')
+    (tmp_path / "b.html").write_text('<p id="there">z</p><a href="a.html">back</a> <a href="https://example.com">out</a>')
+    found = check_site.dead_links(tmp_path)
+    assert [fault.split(": ")[1].split(" ")[0] for fault in found] == ["b.html#here", "gone.html", "no.png"]
