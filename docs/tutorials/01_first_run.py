@@ -74,7 +74,7 @@ plt.show()
 # %%
 # How to read it
 # --------------
-# The dotted errors fall while the world model learns from random actions. The return rises once plans are good enough
+# ``reward_error`` falls while the world model learns what actions earn. The return rises once plans are good enough
 # to bring the pendulum up. ``target_age`` grows with the buffer: plans are made anew now and then, but not all of
 # them.
 #

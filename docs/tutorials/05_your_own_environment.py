@@ -111,25 +111,27 @@ print(launch(config).rpartition(";")[0])
 agent, _, _ = load_agent(run_dir / "checkpoints" / "last.pt")
 positions = torch.linspace(-1.2, 1.2, 121)
 
-figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
 with torch.no_grad():
     for speed in (-0.1, 0.0, 0.1):
         observations = torch.stack([positions, torch.full_like(positions, speed)], -1)
         ended = agent.world_model.termination(agent.world_model.encode(observations))
-        axes[0].plot(positions, ended, label=f"speed {speed:+.1f}")
+        axis.plot(positions, ended, label=f"speed {speed:+.1f}")
 for edge in (-1, 1):
-    axes[0].axvline(edge, color="gray", linestyle=":")
-axes[0].set(xlabel="position", ylabel="predicted probability", title="has the episode ended?")
-axes[0].legend()
+    axis.axvline(edge, color="gray", linestyle=":")
+axis.set(xlabel="position", ylabel="predicted probability", title="has the episode ended?")
+axis.legend()
+plt.show()
 
 # %%
-# And the learned behaviour: close to the right edge, and not over it.
+# And what it does: the reward is highest at the right edge, and over it is the end.
 
+figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
 played = make_env(task, seed=1).append_transform(agent.eval_planner.make_tensordict_primer())
 with torch.no_grad():
     for _ in range(4):
         rollout = played.rollout(50, agent.eval_planner)
-        axes[1].plot(rollout["next", "observation"][:, 0], marker=".", markersize=3)
-axes[1].axhline(1, color="gray", linestyle=":")
-axes[1].set(xlabel="decision", ylabel="position", title="four episodes of the trained agent")
+        axis.plot(rollout["next", "observation"][:, 0], marker=".", markersize=3)
+axis.axhline(1, color="gray", linestyle=":")
+axis.set(xlabel="decision", ylabel="position", title="four episodes of the trained agent")
 plt.show()
