@@ -121,6 +121,14 @@ def compare(
 
     Raises:
         ValueError: if the grid has fewer than two points, or the budget is no multiple of its step.
+
+    >>> from torchrl_etdmpc.analysis import get_benchmark, seed_estimates
+    >>> curve = {"task": "walker-walk", "seed": 1, "env_steps": [0, 100_000, 200_000], "return_mean": [0, 450, 900]}
+    >>> runs = pd.concat([pd.DataFrame({**curve, "method": method}) for method in ("BMPC", "ours")])
+    >>> nothing = seed_estimates(runs.head(0))
+    >>> found = compare(runs, nothing, benchmark=get_benchmark("dmc-easy"), tasks=("walker-walk",))
+    >>> found.methods, found.budget
+    (('BMPC', 'ours'), 200000)
     """
     tasks = tuple(tasks or benchmark.tasks)
     budget = budget or benchmark.budget

@@ -179,6 +179,12 @@ def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: 
         methods (sequence of str): in the order of the legend.
         budget (float): right end of the axis, env steps.
         ylabel (str): what the values are.
+
+    >>> from torchrl_etdmpc.analysis import AGGREGATE
+    >>> curve = pd.DataFrame({"method": "ours", "task": AGGREGATE, "env_steps": [0, 10, 20], "mean": [0.0, 0.5, 1.0]})
+    >>> curve = curve.assign(standard_error=0.1, seeds=3)
+    >>> plot_aggregate(curve, methods=["ours"], budget=20, ylabel="normalised return").axes[0].get_ylabel()
+    'normalised return'
     """
     drawn = set(aggregates.dropna(subset="mean")["method"])
     named = [method for method in methods if method in drawn]
@@ -203,6 +209,12 @@ def plot_auc(areas: pd.DataFrame, *, methods: Sequence[str], ylabel: str) -> Fig
         areas (DataFrame): ``method, auc, standard_error``, one row per method.
         methods (sequence of str): in the order of the bars.
         ylabel (str): what the values are.
+
+    >>> from torchrl_etdmpc.analysis import AGGREGATE
+    >>> areas = pd.DataFrame({"method": ["ours", "theirs"], "task": AGGREGATE, "auc": [0.15, 0.13]})
+    >>> figure = plot_auc(areas.assign(standard_error=0.01, seeds=3), methods=["ours", "theirs"], ylabel="area")
+    >>> len(figure.axes[0].patches)
+    2
     """
     figure = Figure(figsize=(max(0.9 * len(methods) + 1.2, 3.2), 3.2), layout="constrained")
     axis = figure.subplots()

@@ -183,6 +183,12 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
 
     Returns:
         bool: whether the environment is where the saved one was, to the last bit.
+
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> env = make_env("gym/Pendulum-v1", seed=0)
+    >>> state, first = simulator_state(env), env.rollout(3)
+    >>> load_simulator_state(env, state)
+    True
     """
     if state is None:
         return False

@@ -66,6 +66,9 @@ class ProgressBar:
         unit (str): what they are.
         initial (int): steps already done.
         log_every_s (float): seconds between two lines of the log, where the bar is disabled.
+
+    >>> with progress_bar("pretraining", 10, "updates") as bar:
+    ...     bar.update(10)
     """
 
     def __init__(self, bar: Any, phase: str, total: int, unit: str, initial: int, log_every_s: float) -> None:

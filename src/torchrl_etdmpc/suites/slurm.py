@@ -76,6 +76,14 @@ def write_slurm_script(
     Raises:
         ValueError: if ``sbatch`` is not a list of options, or a path holds a line break.
         OSError: if the folder cannot be written.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from torchrl_etdmpc.suites import Experiment
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> experiment = Experiment("heads", ("walker-walk",), (1, 2), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> write_slurm_script(experiment.runs(folder), folder, "heads").name
+    'slurm.sh'
     """
     try:
         own = shlex.split(sbatch)

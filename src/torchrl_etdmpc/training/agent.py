@@ -138,6 +138,11 @@ def build_planner(
         warm_start (bool): whether to carry the plan from step to step.
         compile_mode (str, optional): of ``torch.compile``. Default: ``None``, eager.
         group (str): the group's name, for messages. Default: ``"planner"``.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> world_model = build_world_model(preset("cpu").model, observation_dim=3, action_dim=1)
+    >>> build_planner(world_model, preset("cpu").planner, discount=0.99, warm_start=True).horizon
+    3
     """
     schedule = ("every", "num_slices") if group == "reanalyze" else ()  # of ReanalyzeTransform
     values = arguments(config, *schedule)

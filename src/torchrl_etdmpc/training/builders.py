@@ -132,7 +132,17 @@ def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayB
 def build_collector(
     config: TrainConfig, agent: Agent, env: EnvBase, replay: TensorDictReplayBuffer
 ) -> StepCollector | WorkerCollector:
-    """The collector with its random phase: on an environment with ``config.num_envs`` rows, or workers."""
+    """The collector with its random phase: on an environment with ``config.num_envs`` rows, or workers.
+
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> from torchrl_etdmpc.training import TrainConfig, build_agent, preset
+    >>> config = TrainConfig.from_dict(preset("cpu").to_dict() | {"task": "gym/Pendulum-v1"})
+    >>> agent = build_agent(config, observation_dim=3, action_dim=1)
+    >>> collector = build_collector(config, agent, make_env("gym/Pendulum-v1", seed=0), build_replay(config))
+    >>> next(iter(collector))["action"].shape  # of the random phase
+    torch.Size([1, 1])
+    >>> collector.shutdown()
+    """
     if isinstance(config, DistributedConfig):
         return WorkerCollector(config, agent, env, replay, exclude_keys=UNREAD)
     return StepCollector(

@@ -50,6 +50,13 @@ class Evaluator:
         with_lengths (bool): whether the episodes' lengths are reported. Default: ``False``.
         success_return (float, optional): the return from which an episode is a success; see
             :func:`~torchrl_etdmpc.envs.success_return`. Default: ``None``, no success is reported.
+
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> env = make_env("gym/Pendulum-v1", num_envs=2, parallel=False)
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> evaluator = Evaluator(env, agent, episodes=2, seed=0)  # evaluator() plays them
+    >>> evaluator.close()
     """
 
     def __init__(

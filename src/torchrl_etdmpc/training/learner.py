@@ -38,6 +38,14 @@ class Learner:
 
     Raises:
         ValueError: if a setting is out of range.
+
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> from torchrl_etdmpc.training import TrainConfig, preset
+    >>> config = TrainConfig.from_dict(preset("cpu").to_dict() | {"task": "gym/Pendulum-v1", "compile": "off"})
+    >>> learner = Learner(config, make_env("gym/Pendulum-v1", seed=0))
+    >>> learner.env_steps
+    0
+    >>> learner.collector.shutdown()
     """
 
     def __init__(self, config: TrainConfig, env: EnvBase) -> None:

@@ -30,6 +30,8 @@ def follow_own_code(name: str, value: str) -> None:
 
     Raises:
         ValueError: if there is nothing at the path.
+
+    >>> follow_own_code("planner.score", "mean")  # no path, so nothing is imported
     """
     if name in OWN_CODE and (":" in value or (name.endswith("extra_terms") and value != "null")):
         _followed[OWN_CODE[name], value] = import_attribute(value, name)
