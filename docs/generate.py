@@ -69,6 +69,9 @@ def api_page(room: str) -> str:
     for name in names:
         thing = getattr(module, name)
         full = f"{module_name}.{name}"
+        routine = inspect.isclass(thing) or inspect.isfunction(thing) or hasattr(thing, "cache_info")
+        if not (thing.__doc__ if routine else data_doc(room, name)):
+            raise ValueError(f"{full} is public and has no docstring; write one, with an example.")
         elsewhere = re.match(r"torchrl_etdmpc\.(\w+)\.", getattr(thing, "__module__", "") or "")
         if elsewhere and elsewhere[1] != room:
             lines += [f"``{name}`` is :obj:`torchrl_etdmpc.{elsewhere[1]}.{name}`.", ""]
@@ -76,7 +79,7 @@ def api_page(room: str) -> str:
             lines += [f".. autoexception:: {full}", "   :no-members:", ""]
         elif inspect.isclass(thing):
             lines += [f".. autoclass:: {full}", "   :members:", ""]
-        elif inspect.isfunction(thing) or hasattr(thing, "cache_info"):
+        elif routine:
             lines += [f".. autofunction:: {full}", ""]
         else:
             about = textwrap.indent(data_doc(room, name), "   ")
@@ -279,8 +282,27 @@ def equations() -> str:
     return table(["source", "what", "formula", "code", "test"], rows)
 
 
+def unknown_settings() -> list[str]:
+    """Settings that pages name and the configuration does not have, each with its page."""
+    known = {*settings_of(TrainConfig), *settings_of(DistributedConfig)}
+    known.add("planner.compiled_plan")  # an attribute, in a table of contracts
+    groups = "|".join(groups_of(TrainConfig))
+    faults = []
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        if not {"generated", "gallery"} & set(page.relative_to(ROOT).parts):
+            named = re.findall(rf"[ `]((?:{groups})\.\w+)[`=]", page.read_text(encoding="utf-8"))
+            faults += [f"{page.relative_to(ROOT)} names {name}" for name in named if name not in known]
+    return faults
+
+
 def write(folder: Path) -> None:
-    """Writes every part; a file that is as it was is not touched, so that a second build is quick."""
+    """Writes every part; a file that is as it was is not touched, so that a second build is quick.
+
+    Raises:
+        ValueError: if a public name has no docstring, or a page names a setting that does not exist.
+    """
+    if unknown := unknown_settings():
+        raise ValueError(f"settings that do not exist: {'; '.join(unknown)}.")
     parts = {
         "parts/configuration.md": configuration(),
         "parts/commands.md": commands(),
