@@ -122,5 +122,5 @@ for name, values in curves.items():
     print(f"{name:30} {last[0]:22.4f} {last[1]:14.4f}")
 
 # %%
-# Latents can hold the observation if they are asked to. Whether that helps an agent is another question, which this
+# Latents hold the observation if they are asked to. Whether that helps an agent is another question, which this
 # page does not answer: the method does without, on purpose, so that latents hold what rewards and values need.

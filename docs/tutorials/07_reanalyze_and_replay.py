@@ -78,11 +78,12 @@ results = {interval: experiment(interval) for interval in (0, 20, 5)}
 # The age of a plan is the number of updates since it was made. Without reanalyze the mean age grows for ever. With
 # it, growth is slower; it stops only where as many plans are made anew as become old.
 
-figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
 for interval, (_, _, _, (steps, ages), _) in results.items():
-    axes[0].plot(steps, ages, marker=".", label=f"every {interval} updates" if interval else "never")
-axes[0].set(xlabel="updates", ylabel="mean age of the stored plans, updates")
-axes[0].legend(title="reanalyze")
+    axis.plot(steps, ages, marker=".", label=f"every {interval} updates" if interval else "never")
+axis.set(xlabel="updates", ylabel="mean age of the stored plans, updates")
+axis.legend(title="reanalyze")
+plt.show()
 
 # %%
 # What goes stale
@@ -111,10 +112,11 @@ for low, high in zip(edges[:-1], edges[1:], strict=True):
     if chosen.sum() >= 5:
         middles.append(int(low + high) / 2)
         medians.append(kl[chosen].median().item())
-axes[1].plot(middles, medians, marker="o", label="stored plan")
-axes[1].axhline(floor.median(), color="gray", linestyle="--", label="another fresh plan")
-axes[1].set(xlabel="age of the stored plan, updates", ylabel="KL(fresh || stored), median", yscale="log")
-axes[1].legend()
+figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
+axis.plot(middles, medians, marker="o", label="stored plan")
+axis.axhline(floor.median(), color="gray", linestyle="--", label="another fresh plan")
+axis.set(xlabel="age of the stored plan, updates", ylabel="KL(fresh || stored), median", yscale="log")
+axis.legend()
 plt.show()
 
 # %%

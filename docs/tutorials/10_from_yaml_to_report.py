@@ -26,17 +26,17 @@ experiment = """\
 title: Does reanalyze matter?
 tasks: [gym/Pendulum-v1]
 seeds: 2
-budget: 800
+budget: 500
 settings:
   preset: cpu
-  eval_every: 400
+  eval_every: 250
   eval_episodes: 2
   compile: "off"
   model.mlp_dim: 32
   planner.num_samples: 16
   planner.iterations: 2
   optim.batch_size: 16
-  replay.seed_decisions: 400
+  replay.seed_decisions: 250
   replay.pretrain_updates: 50
 variants:
   reanalyze: {}
@@ -87,5 +87,5 @@ axis.axis("off")
 plt.show()
 
 # %%
-# Two seeds and 800 env steps answer nothing: the intervals are as wide as the curves. For an answer raise ``seeds``
+# Two seeds and 500 env steps answer nothing: the intervals are as wide as the curves. For an answer raise ``seeds``
 # and ``budget`` in the file and run it again; what is finished is not repeated when seeds are added.
