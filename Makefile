@@ -123,5 +123,5 @@ humanoidbench: requirements-humanoidbench.txt
 	@echo 'its tests:   $(HUMANOID_VENV)/bin/python -m pytest tests/envs/test_humanoid_bench.py'
 
 clean:
-	@rm -rf $(VENV) $(HUMANOID_VENV) build dist docs/generated docs/gallery .benchmarks .hypothesis .pytest_cache .ruff_cache
+	@rm -rf $(VENV) $(HUMANOID_VENV) build dist docs/generated docs/gallery sg_execution_times.rst .benchmarks .hypothesis .pytest_cache .ruff_cache
 	@find . -path ./runs -prune -o \( -name __pycache__ -o -name '*.egg-info' \) -type d -prune -exec rm -rf {} +

@@ -58,7 +58,6 @@ exclude_patterns = [
     "docs/generated/parts",
     "benchmarks/results/cpu/report/auc.md",  # without headings: their tables are in the report
     "benchmarks/results/cpu/report/final.md",
-    "docs/sg_execution_times.rst",
     "docs/gallery/sg_execution_times.rst",
 ]
 nitpicky = True

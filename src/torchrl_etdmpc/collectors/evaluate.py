@@ -13,7 +13,11 @@ from torchrl.envs.utils import set_exploration_type
 
 
 class Episodes(NamedTuple):
-    """What the episodes of an evaluation came to."""
+    """What the episodes of an evaluation came to.
+
+    >>> Episodes(returns=torch.tensor([90.0, 110.0]), lengths=torch.tensor([200, 200])).returns.mean().item()
+    100.0
+    """
 
     returns: Tensor
     """Undiscounted return of each, float32 ``[episodes]``."""
@@ -51,7 +55,7 @@ def evaluate(
     >>> from torchrl.envs import GymEnv, RewardSum, TransformedEnv
     >>> from torchrl.envs.utils import RandomPolicy
     >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardSum())
-    >>> evaluate(env, RandomPolicy(env.action_spec), episodes=2).shape
+    >>> evaluate(env, RandomPolicy(env.action_spec), episodes=2).returns.shape
     torch.Size([2])
     """
     if episodes < 1:
