@@ -59,6 +59,12 @@ def public_names(room: str) -> list[str]:
     return sorted(importlib.import_module(f"torchrl_etdmpc.{room}").__all__)
 
 
+def public(room: str, name: str) -> typing.Any:
+    """The object behind a public name, also where a loader has put the file of that name in its place."""
+    thing = getattr(importlib.import_module(f"torchrl_etdmpc.{room}"), name)
+    return getattr(thing, name) if inspect.ismodule(thing) else thing
+
+
 def api_page(room: str) -> str:
     """reStructuredText of one room: every public name with its docstring."""
     module_name = f"torchrl_etdmpc.{room}"
@@ -67,7 +73,7 @@ def api_page(room: str) -> str:
     lines = [title, "=" * len(title), "", f".. py:module:: {module_name}", "", (module.__doc__ or "").strip(), ""]
     names = public_names(room)
     for name in names:
-        thing = getattr(module, name)
+        thing = public(room, name)
         full = f"{module_name}.{name}"
         routine = inspect.isclass(thing) or inspect.isfunction(thing) or hasattr(thing, "cache_info")
         if not (thing.__doc__ if routine else data_doc(room, name)):
