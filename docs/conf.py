@@ -125,9 +125,19 @@ sphinx_gallery_conf = {
 }
 
 
-def _plain_code(app, docname, source) -> None:
-    """The tests' mark of a block that cannot run by itself means nothing to a highlighter."""
+def _for_the_site(app, docname, source) -> None:
+    """A link to a folder leads to a file in it, and the tests' mark of a block that cannot run alone is left out."""
+    folder = (ROOT / docname).parent
     source[0] = re.sub(r"```python fragment", "```python", source[0])
+    source[0] = re.sub(r"\]\(([^)#:]+)\)", lambda link: f"]({_file(folder, link[1])})", source[0])
+
+
+def _file(folder: Path, link: str) -> str:
+    if not (folder / link).is_dir():
+        return link
+    inside = [*sorted((folder / link).glob("README.md")), *sorted((folder / link).rglob("*.csv"))]
+    inside += sorted((folder / link).glob("*.*"))
+    return os.path.relpath(inside[0], folder)
 
 
 def _constructor(app, what, name, obj, options, signature, returns):
@@ -146,6 +156,6 @@ def _no_type(app, what, name, obj, options, lines) -> None:
 def setup(app) -> None:
     warnings.filterwarnings("ignore", message=".*auto_register_policy_transforms.*", category=FutureWarning)
     app.connect("builder-inited", lambda app: generate.write(DOCS / "generated"), priority=1)
-    app.connect("source-read", _plain_code)
+    app.connect("source-read", _for_the_site)
     app.connect("autodoc-process-signature", _constructor)
     app.connect("autodoc-process-docstring", _no_type, priority=1)

@@ -222,8 +222,9 @@ def _runs(folder: Path) -> dict[int, tuple[list[dict], dict]]:
 
 def learned_tasks() -> list[Path]:
     """Folders of committed runs of the cpu preset, one for each task."""
+    wide = [path.parent for path in sorted((RESULTS / "width-128").glob("*/seed1"))]
     folders = [path.parent for path in sorted(RESULTS.glob("*/seed1"))]
-    return [folder for folder in folders if folder.name not in ("bf16", "tdmpc2-walker-stand")]
+    return wide + [folder for folder in folders if folder.name not in ("bf16", "tdmpc2-walker-stand")]
 
 
 def curves() -> str:
@@ -244,6 +245,7 @@ def curves() -> str:
             band = f"{statistics.mean(values):.0f} [{min(values):.0f}, {max(values):.0f}]" if complete else "–"
             cells.append(band)
         name = "gym/Pendulum-v1" if folder.name == "gym-pendulum" else folder.name
+        name += "" if folder.parent.name == "width-128" else ", half the width"
         shown.append([name, len(runs), *cells])
         walls = [summary["wall_time_s"] / 60 for _, summary in runs.values()]
         speeds = [summary["decisions_per_second"] for _, summary in runs.values()]
