@@ -40,11 +40,12 @@ ROOMS = (
     "runs",
     "training",
     "suites",
+    "inspector",
     "analysis",
     "testing",
     "commands",
 )
-COMMANDS = ("train", "train_dmc", "distributed", "suite", "evaluate", "export", "report")
+COMMANDS = ("train", "train_dmc", "distributed", "suite", "evaluate", "export", "report", "study")
 Rows = typing.Iterable[typing.Sequence[object]]
 
 

@@ -21,6 +21,8 @@ WITHOUT_EXAMPLE = {
     "analysis.Comparison",
     "analysis.write_report",
     "commands.main",
+    "inspector.Episode",
+    "inspector.Rolled",
     "suites.Sweep",
     "suites.run_locally",
     "suites.run_on_ray",
@@ -125,7 +127,10 @@ def test_the_ranges_of_the_markers_are_those_of_the_file(generate):
 
 
 def test_the_commands_explain_themselves(generate):
+    from torchrl_etdmpc.commands import _COMMANDS
+
     text = generate.commands()
+    assert set(_COMMANDS) <= set(generate.COMMANDS)
     for command in generate.COMMANDS:
         assert command == "train_dmc" or re.search(rf"## `{command}`\n\n```text\n\w", text), command
 
