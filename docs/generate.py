@@ -45,7 +45,7 @@ ROOMS = (
     "testing",
     "commands",
 )
-COMMANDS = ("train", "train_dmc", "distributed", "suite", "evaluate", "export", "report", "study")
+COMMANDS = ("train", "train_dmc", "distributed", "suite", "evaluate", "export", "report", "study", "inspect_planner")
 Rows = typing.Iterable[typing.Sequence[object]]
 
 
@@ -299,7 +299,7 @@ def unknown_settings() -> list[str]:
     faults = []
     for page in sorted((ROOT / "docs").rglob("*.md")):
         if not {"generated", "gallery"} & set(page.relative_to(ROOT).parts):
-            named = re.findall(rf"[ `]((?:{groups})\.\w+)[`=]", page.read_text(encoding="utf-8"))
+            named = re.findall(rf"[ `]((?:{groups})\.[a-z]\w*)[`=]", page.read_text(encoding="utf-8"))
             faults += [f"{page.relative_to(ROOT)} names {name}" for name in named if name not in known]
     return faults
 

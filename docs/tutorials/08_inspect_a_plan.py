@@ -76,7 +76,8 @@ plt.show()
 # %%
 # Of a trained agent
 # ------------------
-# The same call works with a learned model: ``load_agent`` of ``torchrl_etdmpc.training`` reads a checkpoint's agent,
+# `The inspector <../inspector.html>`_ shows all of this for a checkpoint, on a page in the browser. In Python the same
+# call works with a learned model: ``load_agent`` of ``torchrl_etdmpc.training`` reads a checkpoint's agent,
 # and ``agent.eval_planner.plan(observations, explore=False, trace=True)`` traces it. There is no truth to hold the
 # plan against then, but three things are worth a look: whether the spread shrinks, whether elites come from the
 # policy's proposals (the first ones of ``trace.actions``), and at which depth the heads begin to disagree.
