@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import inspect
-
 import pytest
 import torch
 
@@ -14,42 +12,8 @@ from torchrl_etdmpc.inspector.studies.replan import (
     replan,
     return_estimates,
     true_returns,
-    variant,
-    with_beta,
 )
-from torchrl_etdmpc.planners import EnsembleMPPIPlanner, FinalScore, LatentEnv
 from torchrl_etdmpc.testing import LineWorld, LQRWorld
-
-# What a planner may be asked for and a variant keeps; iterations hold the extra ones.
-NOT_KEPT = {"env", "extra_iterations", "large_action_dim", "beta", "action_key", "plan_key"}
-
-
-def test_a_variant_keeps_every_setting_that_is_not_changed():
-    settings = {
-        **{"horizon": 4, "num_samples": 20, "num_elites": 5, "num_proposals": 3, "iterations": 2},
-        **{"score": FinalScore(beta=2.0), "discount": 0.9, "inverse_temperature": 0.7, "std_min": 0.1, "std_max": 1.5},
-        **{"first_action": "mean", "eval_first_action": "elite", "warm_start": False, "scoring_dtype": torch.float64},
-        **{"proposal_log_std_min": -2.5, "proposal_log_std_max": 0.5, "observation_key": "o", "latent_key": "z"},
-        **{"is_init_key": "i", "plan_mean_key": "p"},
-    }
-    assert settings.keys() == inspect.signature(EnsembleMPPIPlanner).parameters.keys() - NOT_KEPT
-    planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), **settings)
-    same, other = variant(planner), variant(planner, horizon=6)
-    for name in settings:
-        if not name.startswith("proposal"):
-            assert getattr(same, name) == settings[name], name
-    assert same.proposal_log_std_bounds == (-2.5, 0.5)
-    assert (other.horizon, other.num_samples, planner.horizon) == (6, 20, 4)
-    many = EnsembleMPPIPlanner(LatentEnv(LineWorld(action_dim=21)), num_proposals=0)
-    assert variant(many).iterations == many.iterations == 8
-    assert other.world_model is planner.world_model
-
-
-def test_a_beta_is_set_where_the_score_has_one():
-    planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), score="final")
-    assert with_beta(planner, 3).score == FinalScore(beta=3.0)
-    with pytest.raises(ValueError, match="score must be one with a beta"):
-        with_beta(variant(planner, score=lambda returns: returns.amax((-3, -2, -1))), 3)
 
 
 def test_many_states_are_planned_as_few_are(make_planner):

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.replan import (
     best_sequences,
     encode,
     generator_of,
     imagine,
     replan,
-    variant,
 )
 from torchrl_etdmpc.inspector.studies.states import States, TrueWorld, episode_interval, roll_all
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
@@ -58,7 +58,7 @@ def calibration(
         raise ValueError(
             f"num_dynamics must be at least 2 for heads to disagree, got {planner.world_model.num_dynamics}."
         )
-    searcher = variant(planner, horizon=horizon)
+    searcher = with_settings(planner, horizon=horizon)
     planned = best_sequences(replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True))
     random = torch.rand(planned.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
     said, was = [], []

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.replan import (
     best_sequences,
     generator_of,
@@ -14,7 +15,6 @@ from torchrl_etdmpc.inspector.studies.replan import (
     replan,
     return_estimates,
     true_returns,
-    variant,
 )
 from torchrl_etdmpc.inspector.studies.states import States, TrueWorld, episode_interval, roll_all
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
@@ -71,11 +71,11 @@ def cross_scoring(
         decisions (int): of an episode. Default: 500.
         seed (int): of the plans.
     """
-    budget = {"num_samples": num_samples, "num_elites": num_elites, "iterations": iterations}
+    budget = {"num_samples": num_samples, "num_elites": num_elites, "iterations": iterations, "extra_iterations": 0}
     proposals = num_proposals if planner.num_proposals else 0
     found = []
     for score in (_single_head, _all_heads):
-        searcher = variant(planner, horizon=horizon, score=score, num_proposals=proposals, **budget)
+        searcher = with_settings(planner, horizon=horizon, score=score, beta=0.0, num_proposals=proposals, **budget)
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         found.append(best_sequences(plan))
     found.append(policy_sequences(planner, states.observation, horizon))

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
-from torchrl_etdmpc.inspector.studies.replan import generator_of, replan, variant
+from torchrl_etdmpc.inspector.settings import with_settings
+from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.inspector.studies.states import States, episode_interval
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.planners.scores import AdaptiveScore
 
 
 class HorizonWeights(NamedTuple):
@@ -50,7 +50,7 @@ def horizon_weights(
     """
     fields = []
     for beta in betas:
-        searcher = variant(planner, horizon=horizon, score=AdaptiveScore(beta=float(beta)))
+        searcher = with_settings(planner, horizon=horizon, score="adaptive", beta=float(beta))
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         assert plan.trace is not None
         elites = plan.trace.scores.topk(searcher.num_elites, dim=-1).indices[..., None]

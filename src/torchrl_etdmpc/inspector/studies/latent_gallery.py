@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_etdmpc.functional import ensemble_variance
+from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.components import components
 from torchrl_etdmpc.inspector.studies.replan import (
     best_sequences,
@@ -18,8 +19,6 @@ from torchrl_etdmpc.inspector.studies.replan import (
     replan,
     return_estimates,
     true_returns,
-    variant,
-    with_beta,
 )
 from torchrl_etdmpc.inspector.studies.states import States, TrueWorld, episode_interval, roll_all
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
@@ -82,7 +81,7 @@ def latent_gallery(
     """
     fields = []
     for beta in betas:
-        searcher = with_beta(variant(planner, horizon=horizon or planner.horizon), beta)
+        searcher = with_settings(planner, horizon=horizon or planner.horizon, beta=beta)
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         actions = best_sequences(plan)
         rolled = roll_all(simulator, states, actions)

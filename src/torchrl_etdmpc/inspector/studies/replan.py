@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import torch
@@ -21,46 +20,9 @@ __all__ = [
     "return_estimates",
     "true_returns",
     "values",
-    "variant",
-    "with_beta",
 ]
 
 _AT_ONCE = 64  # states; bounds the memory of a trace
-
-
-def variant(planner: EnsembleMPPIPlanner, **changes: Any) -> EnsembleMPPIPlanner:
-    """A planner on the same networks with other settings, warm start included.
-
-    Args:
-        planner (EnsembleMPPIPlanner): stays as it is.
-        **changes: arguments of :class:`EnsembleMPPIPlanner`.
-
-    >>> from torchrl_etdmpc.planners import LatentEnv
-    >>> from torchrl_etdmpc.testing import LineWorld
-    >>> variant(EnsembleMPPIPlanner(LatentEnv(LineWorld()), horizon=3), horizon=5).horizon
-    5
-    """
-    low, high = planner.proposal_log_std_bounds or (None, None)
-    same = (
-        *("horizon", "num_samples", "num_elites", "num_proposals", "iterations", "score", "discount"),
-        *("inverse_temperature", "std_min", "std_max", "first_action", "eval_first_action", "warm_start"),
-        *("scoring_dtype", "observation_key", "latent_key", "is_init_key", "plan_mean_key"),
-    )
-    settings = {name: getattr(planner, name) for name in same}
-    settings |= {"extra_iterations": 0, "proposal_log_std_min": low, "proposal_log_std_max": high}
-    return EnsembleMPPIPlanner(planner.env, **settings | changes)
-
-
-def with_beta(planner: EnsembleMPPIPlanner, beta: float) -> EnsembleMPPIPlanner:
-    """The planner with another weight of the ensemble's standard deviation.
-
-    Raises:
-        ValueError: if its score has no ``beta``.
-    """
-    score: Any = planner.score
-    if not dataclasses.is_dataclass(score) or not hasattr(score, "beta"):
-        raise ValueError(f"score must be one with a beta (final, mean, adaptive), got {score!r}.")
-    return variant(planner, score=dataclasses.replace(score, beta=float(beta)))  # pyright: ignore[reportArgumentType]
 
 
 def generator_of(planner: EnsembleMPPIPlanner, seed: int) -> torch.Generator:

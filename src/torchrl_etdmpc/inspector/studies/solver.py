@@ -13,11 +13,11 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
 from torchrl_etdmpc.functional.horizon import SIGMA_FLOOR
+from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.gradient_mixture import objective, projected_ascent, softmax_ascent
-from torchrl_etdmpc.inspector.studies.replan import generator_of, replan, variant
+from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.inspector.studies.states import States
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.planners.scores import AdaptiveScore
 
 METHODS = ("softmax", "projected")
 RATES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
@@ -66,7 +66,7 @@ def solver(
     """
     rows = []
     for beta in map(float, betas):
-        searcher = variant(planner, horizon=horizon, score=AdaptiveScore(beta=beta))
+        searcher = with_settings(planner, horizon=horizon, score="adaptive", beta=beta)
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         assert plan.trace is not None
         returns = plan.trace.returns[:, -1].double()
