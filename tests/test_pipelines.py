@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -211,6 +212,7 @@ def fill(source: tuple[str, str], storage: str, sampler: str, path: Path) -> Ten
 def learn(buffer: TensorDictReplayBuffer) -> None:
     """Samples, looks whether a slice is one piece of one episode, and takes a gradient of the loss."""
     model = make_planner().world_model  # seeds PyTorch, too
+    np.random.seed(0)  # TorchRL's prioritized samplers draw from it
     loss = EfficientTDMPCLoss(model, discount=0.9)
     SoftUpdate(loss, tau=0.01)
     for _ in range(8):
