@@ -83,3 +83,20 @@ def test_an_environment_without_processes_has_none_to_start():
     env = make_env("pendulum-swingup", seed=0, num_envs=2, parallel=False)
     assert isinstance(env, SerialEnv)
     assert not start_workers_anew(env.append_transform(StepCounter()))
+
+
+def test_processes_that_cannot_start_again_hide_no_failure(monkeypatch):
+    def refuse(env):
+        raise EOFError
+
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.start_workers_anew", refuse)
+    env = make_env("pendulum-swingup", seed=0)
+    collector = collect(env)
+    collector.step()
+
+    def fail(tensordict):
+        raise RuntimeError("worker 1 dead")
+
+    monkeypatch.setattr(env, "step_and_maybe_reset", fail)
+    with pytest.raises(SimulatorError, match="^the environment failed at decision step 1: worker 1 dead"):
+        collector.step()

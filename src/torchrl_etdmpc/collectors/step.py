@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -196,7 +197,8 @@ class StepCollector(BaseCollector):
             return method(*args)
         except Exception as error:
             self._truncate_episodes()
-            start_workers_anew(self.env)
+            with contextlib.suppress(Exception):  # then the next step fails as well, and the run ends after a few
+                start_workers_anew(self.env)
             raise SimulatorError(
                 f"the environment failed at decision step {self._frames}: {first_line(error)}"
             ) from error

@@ -15,8 +15,7 @@ from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM
 
 __all__ = ["render_frame"]
 
-_DMC_SIZE = 384
-_HUMANOID_SIZE = (384, 384)
+_DMC_SIZE = 384  # HumanoidBench, too
 # Camera 0 of the quadruped looks from straight above; 2 follows it from the side.
 _CAMERAS = {"quadruped": 2}
 # What MUJOCO_GL may say for "no rendering".
@@ -61,7 +60,7 @@ def render_frame(
         kind = type(base).__name__
         raise ValueError(f"render_frame needs one environment of dm_control, Gymnasium or HumanoidBench, got {kind}.")
     if isinstance(base, RecordedHumanoidBenchEnv):
-        return _humanoid_frame(base, *_size(height, width, _HUMANOID_SIZE), camera_id)
+        return _humanoid_frame(base, *_size(height, width, (_DMC_SIZE, _DMC_SIZE)), camera_id)
     if camera_id is not None:
         raise ValueError(f"camera_id is for dm_control; Gymnasium chooses its own camera, got camera_id={camera_id}.")
     return _gymnasium_frame(base, height, width)
