@@ -43,6 +43,13 @@ def test_compilation_is_named_where_something_is_compiled(monkeypatch):
     assert what_it_takes(PRESETS["cpu"], cpu, compiled=False).endswith("minutes on this CPU")
 
 
+def test_a_first_product_that_takes_a_minute_changes_nothing(monkeypatch):
+    config = PRESETS["cpu"]
+    monkeypatch.setattr(module.timeit, "repeat", lambda *args, **kwargs: [60.0, 0.002, 0.001])
+    rows, width = min(config.planner.num_samples * config.model.num_dynamics, 2048), config.model.mlp_dim
+    assert module._flops_per_second(config) == 2.0 * rows * width**2 / 0.001
+
+
 def test_an_estimate_draws_no_random_numbers():
     torch.manual_seed(0)
     before = torch.get_rng_state()

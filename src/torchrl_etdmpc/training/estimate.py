@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import timeit
 
 import torch
 
@@ -109,9 +109,6 @@ def _flops_per_second(config: TrainConfig) -> float:
     """Of matrix products such as the planner's, on this machine and now."""
     rows = min(config.planner.num_samples * config.model.num_dynamics, 2048)
     left, right = torch.ones(rows, config.model.mlp_dim), torch.ones(config.model.mlp_dim, config.model.mlp_dim)
-    products, began = 0, time.perf_counter()
-    while products < 3 or time.perf_counter() - began < 0.02:
-        _ = left @ right
-        products += 1
-    seconds = time.perf_counter() - began
-    return 2.0 * rows * config.model.mlp_dim**2 * products / seconds
+    # The first product of a process loads its library, which may take seconds.
+    seconds = min(timeit.repeat(lambda: left @ right, number=1, repeat=10))
+    return 2.0 * rows * config.model.mlp_dim**2 / seconds
