@@ -2,53 +2,37 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
-from torchrl_etdmpc.envs import Task, get_task, make_env, render_frame, success_return
+from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
-from torchrl_etdmpc.training import TrainConfig, load_agent, read_agent_file, resolve_device
+from torchrl_etdmpc.training import load_agent, resolve_device
 
 GIF_SIZE = 200  # pixels, for a page
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks
 
 
-@dataclass(frozen=True)
-class EvaluateConfig:
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig(AgentCommandConfig):
     """What to evaluate."""
 
-    checkpoint: str
-    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
     episodes: int = 10
     """How many are played, side by side unless there is a film."""
     policy: Literal["planner", "bare"] = "planner"
     """``bare`` is the policy network without the planner."""
     video: str | None = None
     """A file that ends in .mp4 or .gif, for a film of the first episode."""
-    task: str | None = None
-    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
-    action_repeat: int | None = None
-    """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
-    episode_length: int | None = None
-    """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
-    terminates: bool | None = None
-    """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
-    score: str | None = None
-    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
-    reanalyze_score: str | None = None
-    """Likewise a ``reanalyze.score``."""
-    extra_terms: str | None = None
-    """Likewise ``loss.extra_terms``."""
     seed: int = 0
     """Of the initial states and the planner's samples."""
     device: str = "auto"
@@ -63,25 +47,11 @@ class EvaluateConfig:
             raise ValueError(f"video must end in .mp4 or .gif, got {self.video!r}.")
 
 
-def task_of(config: Any) -> Task:
-    """The task that the command names, or the one that the agent was trained on, with what its run changed about it.
-
-    Args:
-        config (EvaluateConfig): or any other with its ``checkpoint``, ``task`` and changes to the task.
-    """
-    changes = {name: getattr(config, name) for name in ("action_repeat", "episode_length", "terminates")}
-    told = {name: value for name, value in changes.items() if value is not None}
-    stored = read_agent_file(config.checkpoint)["config"]
-    if config.task is not None and config.task != stored["task"]:
-        return get_task(config.task, **told)
-    return dataclasses.replace(TrainConfig.from_dict(stored).task_spec, **told)
-
-
 @hydra_main(CONFIG, "evaluate", EvaluateConfig)
 def main(config: EvaluateConfig) -> None:
     """Plays episodes with a trained agent, and films the first one if asked to."""
     device = resolve_device(config.device)
-    task = task_of(config)
+    task = config.task_spec
     # A film needs the one environment that it shows; otherwise the episodes run side by side.
     env = make_env(task, seed=config.seed, num_envs=1 if config.video else config.episodes, parallel=False)
     agent, _, counters = load_agent(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.planners import export_planner, export_policy
@@ -14,30 +15,14 @@ from torchrl_etdmpc.runs import replacing
 from torchrl_etdmpc.training import load_agent
 
 
-@dataclass(frozen=True)
-class ExportConfig:
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig(AgentCommandConfig):
     """What to export."""
 
-    checkpoint: str
-    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
     out: str = "exported"
     """Folder for policy.pt2 and planner.pt2."""
     batch_size: int = 1
     """States per call of the planner; the policy takes any number."""
-    task: str | None = None
-    """A task of your own, ``module:function``, must be named as it was to train on it."""
-    action_repeat: int | None = None
-    """``task.action_repeat`` on the command line; with a task of your own, what it was trained with."""
-    episode_length: int | None = None
-    """``task.episode_length``; likewise."""
-    terminates: bool | None = None
-    """``task.terminates``; likewise."""
-    score: str | None = None
-    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
-    reanalyze_score: str | None = None
-    """Likewise a ``reanalyze.score``."""
-    extra_terms: str | None = None
-    """Likewise ``loss.extra_terms``."""
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import re
 from collections.abc import Mapping
@@ -14,8 +13,8 @@ import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
-from torchrl_etdmpc.commands.evaluate import EvaluateConfig, task_of
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task
 from torchrl_etdmpc.inspector.inspection import Inspection, State
@@ -26,12 +25,10 @@ from torchrl_etdmpc.training import build_planner, load_agent, read_agent_file, 
 from torchrl_etdmpc.training.config import PlannerConfig
 
 
-@dataclass(frozen=True)
-class InspectConfig:
+@dataclass(frozen=True, kw_only=True)
+class InspectConfig(AgentCommandConfig):
     """What to look at."""
 
-    checkpoint: str
-    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
     state: str = "random"
     """EPISODE:STEP, an episode by its seed and a decision of it; replay:ROW of the buffer that is saved beside the
     checkpoint; or random, a decision of the episode of this seed."""
@@ -47,20 +44,6 @@ class InspectConfig:
     """0 takes a free one."""
     allow_remote: bool = False
     """Whether anybody who reaches the page may use it."""
-    task: str | None = None
-    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
-    action_repeat: int | None = None
-    """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
-    episode_length: int | None = None
-    """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
-    terminates: bool | None = None
-    """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
-    score: str | None = None
-    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
-    reanalyze_score: str | None = None
-    """Likewise a ``reanalyze.score``."""
-    extra_terms: str | None = None
-    """Likewise ``loss.extra_terms``."""
     seed: int = 0
     """Of the random state and the planner's samples."""
     device: str = "auto"
@@ -106,8 +89,7 @@ def main(config: InspectConfig) -> None:
 
 def _inspection(config: InspectConfig) -> Inspection:
     device = resolve_device(config.device)
-    names = [field.name for field in dataclasses.fields(EvaluateConfig)]
-    task = task_of(EvaluateConfig(**{name: getattr(config, name) for name in names if hasattr(config, name)}))
+    task = config.task_spec
     _need_no_renderer(task)
     agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off")
     discount = agent.eval_planner.discount

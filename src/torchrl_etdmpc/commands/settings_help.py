@@ -67,7 +67,10 @@ def settings_of(config_class: type, prefix: str = "") -> dict[str, Setting]:
     """
     hints, meanings = typing.get_type_hints(config_class), _meanings(config_class)
     found: dict[str, Setting] = {}
-    for field in dataclasses.fields(config_class):
+    own = inspect.get_annotations(config_class)
+    fields = dataclasses.fields(config_class)
+    # What must be given comes first, then what this command has of its own.
+    for field in sorted(fields, key=lambda field: (field.default is not dataclasses.MISSING, field.name not in own)):
         hint = hints[field.name]
         if dataclasses.is_dataclass(hint):
             found |= settings_of(typing.cast(type, hint), f"{field.name}.")

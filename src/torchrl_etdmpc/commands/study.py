@@ -20,8 +20,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
-from torchrl_etdmpc.commands.evaluate import task_of
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
@@ -44,34 +44,18 @@ StudyName = Literal[
 ]
 
 
-@dataclass(frozen=True)
-class StudyConfig:
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig(AgentCommandConfig):
     """What to study."""
 
     study: StudyName
     """The study, also written without ``study=`` as the first argument; ``all`` makes every one."""
-    checkpoint: str
-    """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
     out: str = "studies"
     """Folder for NAME.png, NAME.csv, NAME.npz and NAME.json."""
     episodes: int = 10
     """How many the planner plays; intervals are over episodes."""
     states: int = 200
     """How many are drawn from them."""
-    task: str | None = None
-    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
-    action_repeat: int | None = None
-    """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
-    episode_length: int | None = None
-    """Environment steps until the time limit (``task.episode_length``). Default: as it was trained."""
-    terminates: bool | None = None
-    """Whether episodes can end before their time limit (``task.terminates``). Default: as it was trained."""
-    score: str | None = None
-    """A ``planner.score`` of your own, ``module:function``, must be named as it was to train with it."""
-    reanalyze_score: str | None = None
-    """Likewise a ``reanalyze.score``."""
-    extra_terms: str | None = None
-    """Likewise ``loss.extra_terms``."""
     seed: int = 0
     """Of the episodes, the choice of states and the plans."""
     device: str = "auto"
@@ -97,7 +81,7 @@ def _main(config: StudyConfig) -> None:
     """Measures what a trained planner believes, and what is true of it."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ImportError("this command needs matplotlib; run: pip install matplotlib")
-    task, device = task_of(config), resolve_device(config.device)
+    task, device = config.task_spec, resolve_device(config.device)
     env = make_env(task, seed=config.seed)
     agent, _, counters = load_agent(
         config.checkpoint,
