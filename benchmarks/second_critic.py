@@ -1,11 +1,11 @@
 """TD-MPC2 at the cpu preset's size beside the cpu preset, on walker-stand.
 
-    python benchmarks/second_critic.py                 # the committed run (some minutes)
-    python benchmarks/second_critic.py --seeds 1 2 3
+    python benchmarks/second_critic.py                 # one seed, some minutes
+    python benchmarks/second_critic.py --seeds 1 2 3   # the committed runs
     python benchmarks/second_critic.py --report-only   # from the committed curves
 
 Writes `benchmarks/results/cpu/tdmpc2-walker-stand/`: `seed<k>/{eval.csv,summary.json}`, `curves.png` and `README.md`.
-The cpu preset's runs are those of `cpu_learning.py`, up to the same budget.
+The cpu preset's runs are those of `docs/studies/cpu-width.md`, at the same sizes and up to the same budget.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from torchrl_etdmpc.runs import RunDirectory
 
 TASK, ENV_STEPS, PRESET = "walker-stand", 25_000, "tdmpc2-cpu"
 FOLDER = RESULTS / f"tdmpc2-{TASK}"
+BESIDE = RESULTS / "width-128" / TASK
 
 
 def report() -> str:
     """Every evaluation of both, and the figure beside it."""
-    curves = read_runs([RESULTS / TASK, FOLDER])
+    curves = read_runs([BESIDE, FOLDER])
     curves = curves[curves["env_steps"] <= ENV_STEPS]
     methods = ["cpu", PRESET]
     figure = plot_curves(estimate(curves), tasks=[TASK], methods=methods, budget=ENV_STEPS)
@@ -34,7 +35,8 @@ def report() -> str:
         "# TD-MPC2 at the cpu preset's size",
         "",
         f"Made by `python benchmarks/second_critic.py`: `preset={PRESET}` on {TASK}, one thread, beside the runs of",
-        "`cpu_learning.py`. Return of every evaluation (mean of 10 episodes, planner without noise) by env steps.",
+        f"`preset=cpu` in `{BESIDE.relative_to(RESULTS)}`. Return of every evaluation (mean of 10 episodes, planner without",
+        "noise) by env steps.",
         "",
         "| preset | seed | " + " | ".join(f"{steps:.0f}" for steps in table.columns) + " |",
         "|---" * (2 + len(table.columns)) + "|",
