@@ -37,7 +37,7 @@ def test_the_full_size_on_a_cpu_is_said_to_take_long_and_the_small_preset_is_nam
 
 
 def test_compilation_is_named_where_something_is_compiled(monkeypatch):
-    monkeypatch.setattr(module, "_flops_per_second", lambda config: 1e10)
+    monkeypatch.setattr(module, "_flops_per_second", lambda config: 1e11)
     cpu = torch.device("cpu")
     assert what_it_takes(PRESETS["cpu"], cpu).endswith("before it some minutes to compile the first time")
     assert what_it_takes(PRESETS["cpu"], cpu, compiled=False).endswith("minutes on this CPU")
