@@ -65,8 +65,10 @@ SETTINGS = {
     "replay": {"seed_decisions": 40, "pretrain_updates": 4},
 }
 KINDS = {"one environment": {"compile": "off"}, "three environments": {"compile": "off", "num_envs": 3}}
-KINDS |= {"compiled": {"compile": "default"}}
-SHARES = {"one environment": 0.55, "three environments": 0.4, "compiled": 0.05}  # of all kills
+KINDS["compiled"] = {"compile": "default"}
+if importlib.util.find_spec("humanoid_bench"):  # with the Python of `make humanoidbench`; episodes of different lengths
+    KINDS["HumanoidBench"] = {"compile": "off", "num_envs": 3, "task": "h1hand-stand"}
+SHARES = {"one environment": 0.55, "three environments": 0.4, "compiled": 0.05, "HumanoidBench": 0.1}  # of all kills
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 EXPECTED = {0, EXIT_CODE, 130} | {-number for number in SIGNALS} | {128 + number for number in SIGNALS}
 LIMIT_S = 600
