@@ -86,7 +86,7 @@ def command(run_dir: Path, changes: Mapping[str, Any]) -> list[str]:
         for name, value in values.items()
         for key, item in (value.items() if isinstance(value, dict) else [("", value)])
     ]
-    script = str(ROOT / "examples" / "train_dmc.py")
+    script = str(ROOT / "examples" / "train.py")
     return [sys.executable, script, *flat, f"run_dir={run_dir}", "resume=auto"]
 
 
