@@ -16,26 +16,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-# Public names without an example: what they do takes a whole run, a cluster or a command. Nothing is added.
-WITHOUT_EXAMPLE = {
-    "analysis.Comparison",
-    "analysis.write_report",
-    "commands.main",
-    "inspector.Episode",
-    "inspector.Rolled",
-    "inspector.Trace",
-    "inspector.add_simulation",
-    "inspector.load_trace",
-    "inspector.trace_torchrl_planner",
-    "suites.Sweep",
-    "suites.run_locally",
-    "suites.run_on_ray",
-    "training.AgentFile",
-    "training.BestAgent",
-    "training.TrainingRun",
-    "training.WorkerCollector",
-    "training.launch",
-}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +54,7 @@ def test_every_public_name_has_an_example(generate):
         for name, thing in documented(generate, room)
         if ">>>" not in (thing.__doc__ or "")
     }
-    assert missing == WITHOUT_EXAMPLE
+    assert missing == set()
 
 
 def test_the_equations_name_functions_and_tests_that_exist(generate):

@@ -46,6 +46,16 @@ class Comparison:
         returns (DataFrame): at fixed steps, of methods and points, see :func:`returns_at`.
         paired (DataFrame): differences between variants, see :func:`compare_paired`; no row if none was asked for.
         notes (tuple of str): what a reader must know about the data.
+
+    >>> from torchrl_etdmpc.analysis import get_benchmark, seed_estimates
+    >>> curve = {"task": "walker-walk", "seed": 1, "env_steps": [0, 100_000, 200_000], "return_mean": [0, 450, 900]}
+    >>> runs = pd.concat([pd.DataFrame({**curve, "method": method}) for method in ("BMPC", "ours")])
+    >>> nothing = seed_estimates(runs.head(0))
+    >>> found = compare(runs, nothing, benchmark=get_benchmark("dmc-easy"), tasks=("walker-walk",))
+    >>> isinstance(found, Comparison)
+    True
+    >>> list(found.areas.columns)
+    ['method', 'task', 'auc', 'seeds', 'standard_error']
     """
 
     benchmark: Benchmark

@@ -52,6 +52,16 @@ def write_report(
 
     Returns:
         Path: of ``index.md``.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.analysis import compare, get_benchmark, seed_estimates
+    >>> curve = {"task": "walker-walk", "seed": 1, "env_steps": [0, 100_000, 200_000], "return_mean": [0, 450, 900]}
+    >>> runs = pd.concat([pd.DataFrame({**curve, "method": method}) for method in ("BMPC", "ours")])
+    >>> nothing = seed_estimates(runs.head(0))
+    >>> found = compare(runs, nothing, benchmark=get_benchmark("dmc-easy"), tasks=("walker-walk",))
+    >>> page = write_report(found, tempfile.mkdtemp())
+    >>> page.name, sorted(file.name for file in page.parent.glob("*.png"))
+    ('index.md', ['aggregate.png', 'auc.png', 'curves.png'])
     """
     out = Path(out)
     files = _tables(comparison)

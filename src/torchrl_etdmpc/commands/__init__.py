@@ -35,6 +35,12 @@ def main(command: str | None = None) -> None:
     Args:
         command (str, optional): ``"train"``, ``"train_dmc"``, ``"distributed"``, ``"evaluate"``, ``"export"``,
             ``"report"``, ``"suite"``, ``"study"`` or ``"inspect_planner"``. Default: the first argument.
+
+    >>> import contextlib
+    >>> from unittest.mock import patch
+    >>> with patch("sys.argv", ["torchrl-etdmpc", "--version"]), contextlib.suppress(SystemExit):
+    ...     main()
+    torchrl-etdmpc ...
     """
     if command is None:
         command = _first_argument()

@@ -20,7 +20,14 @@ __all__ = ["Episode", "Rolled", "Simulator", "play_episode"]
 
 
 class Episode(NamedTuple):
-    """An episode of T decisions, on the CPU."""
+    """An episode of T decisions, on the CPU.
+
+    >>> from torchrl_etdmpc import WorldModel
+    >>> from torchrl_etdmpc.planners import BarePolicy
+    >>> episode = play_episode(BarePolicy(WorldModel(3, 1)), "gym/Pendulum-v1", seed=0, steps=5)
+    >>> episode.action.shape, len(episode.states), episode.terminated
+    (torch.Size([5, 1]), 6, False)
+    """
 
     observation: Tensor
     """``[T + 1, O]``"""
@@ -39,7 +46,12 @@ class Episode(NamedTuple):
 
 
 class Rolled(NamedTuple):
-    """What followed from a sequence of T actions; fewer where the episode ended on the way."""
+    """What followed from a sequence of T actions; fewer where the episode ended on the way.
+
+    >>> rolled = Simulator("gym/Pendulum-v1").roll(torch.zeros(4, 1))
+    >>> rolled.observation.shape, rolled.reward.shape, rolled.frames
+    (torch.Size([5, 3]), torch.Size([4]), None)
+    """
 
     observation: Tensor
     """``[T + 1, O]``, the one before the first action included."""

@@ -40,6 +40,16 @@ def trace_torchrl_planner(
     Raises:
         TypeError: if it is another planner.
         ValueError: if ``state`` has a batch.
+
+    >>> from tensordict import TensorDict
+    >>> from torchrl_etdmpc import LatentEnv
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> env = LatentEnv(LineWorld())
+    >>> planner = CEMPlanner(env, planning_horizon=3, optim_steps=2, num_candidates=16, top_k=4)
+    >>> state = env.reset(TensorDict({"observation": torch.tensor([0.5])}, []))
+    >>> trace = trace_torchrl_planner(planner, state)
+    >>> trace["actions"].shape, trace.get("policy_action")  # [I, N, H, A]; it has no policy
+    ((2, 16, 3, 1), None)
     """
     if not isinstance(planner, CEMPlanner | MPPIPlanner):
         raise TypeError(

@@ -127,6 +127,16 @@ class Trace:
 
     Raises:
         TraceError: if an array is missing, has another shape or is unknown.
+
+    >>> from torchrl_etdmpc import LatentEnv
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(LineWorld(num_dynamics=2)), horizon=3, num_samples=32, num_elites=4)
+    >>> trace = trace_plan(planner, torch.tensor([0.5]))
+    >>> trace["scores"].shape, trace["returns"].shape  # [I, N] and [I, N, D, F, V]
+    ((6, 32), (6, 32, 3, 2, 1))
+    >>> best = trace["scores"][-1].argmax()
+    >>> bool(trace["elites"][-1, 0] == best)
+    True
     """
 
     manifest: Mapping[str, Any]
@@ -215,6 +225,15 @@ def load_trace(path: str | Path) -> Trace:
 
     Raises:
         TraceError: if it is missing, no trace, of a newer format, or damaged.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc import LatentEnv
+    >>> from torchrl_etdmpc.testing import LineWorld
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), horizon=3, num_samples=32, num_elites=4)
+    >>> trace = trace_plan(planner, torch.tensor([0.5]), task="line")
+    >>> again = load_trace(trace.save(Path(tempfile.mkdtemp()) / "plan.npz"))
+    >>> again.manifest["task"], bool((again["actions"] == trace["actions"]).all())
+    ('line', True)
     """
     path = Path(path).expanduser()
     try:
@@ -357,6 +376,17 @@ def add_simulation(
         observations (Tensor): ``[R + 1, O]``.
         frames (Tensor, optional): uint8 ``[R + 1, height, width, 3]``.
         model (PredictionModel): the planner's, which encodes the observations.
+
+    >>> from torchrl_etdmpc import LatentEnv, WorldModel
+    >>> from torchrl_etdmpc.inspector import Simulator
+    >>> model = WorldModel(3, 1, latent_dim=16, mlp_dim=16, encoder_dim=16)
+    >>> planner = EnsembleMPPIPlanner(LatentEnv(model), horizon=3, num_samples=16, num_elites=4, num_proposals=2)
+    >>> simulator = Simulator("gym/Pendulum-v1")
+    >>> trace = trace_plan(planner, simulator.observation)
+    >>> rolled = simulator.roll(torch.from_numpy(trace["chosen_actions"]))
+    >>> both = add_simulation(trace, rolled.reward, rolled.observation, rolled.frames, model)
+    >>> both["chosen_rewards"].shape, both["real_rewards"].shape  # [H, F] imagined, [R] real
+    ((3, 4), (3,))
     """
     arrays = {**trace.arrays, "real_rewards": as_array(rewards)}
     if trace.get("basis") is not None:

@@ -52,6 +52,19 @@ def run_locally(queue: RunQueue, *, workers: int | None = None, per_gpu: int = 1
 
     Returns:
         bool: ``False`` if a signal stopped it.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from torchrl_etdmpc.runs import RunLog
+    >>> from torchrl_etdmpc.suites import Experiment
+    >>> experiment = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> (run,) = experiment.runs(Path(tempfile.mkdtemp()))
+    >>> directory = RunDirectory(run.path)
+    >>> directory.begin(run.config.to_dict())
+    >>> _ = RunLog(directory, total_env_steps=50_000).finish({"env_steps": 50_000, "decisions_per_second": 30.0})
+    >>> directory.close()
+    >>> run_locally(RunQueue([run]), workers=2)  # what is finished is not trained again
+    True
     """
     gpus = visible_gpus()
     cores = usable_cores()

@@ -51,6 +51,11 @@ def run_on_ray(
         ImportError: if Ray is missing.
         OSError: if there is no cluster at the address.
         ValueError: if the address is none, or no node has what a run needs.
+
+    >>> run_on_ray(RunQueue([]), address="head-node")
+    Traceback (most recent call last):
+        ...
+    ValueError: address must be host:port, ray://host:port or auto, got 'head-node'.
     """
     with _cluster(address) as ray, StopSignals() as stop:
         stop.nothing_to_save = False

@@ -36,6 +36,13 @@ class Sweep:
     Raises:
         ImportError: if Optuna is missing.
         ValueError: if the file cannot be read.
+
+    >>> import tempfile
+    >>> search = Search({"optim.lr": {"low": 1e-4, "high": 3e-3, "log": True}}, trials=20, settings={"preset": "cpu"})
+    >>> experiment = Experiment("rates", ("walker-walk",), (1, 2), {}, {"lr": search}, budget=50_000)
+    >>> sweep = Sweep(experiment, "lr", Path(tempfile.mkdtemp()))
+    >>> [f"{run.variant}, seed {run.seed}" for run in sweep.propose()]
+    ['lr trial 0, seed 1', 'lr trial 0, seed 2']
     """
 
     def __init__(

@@ -42,6 +42,13 @@ class AgentFile:
         agent (Agent): the parts.
         config (TrainConfig): the run.
         counters (callable): returns e.g. env_steps, decision_steps, updates.
+
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> file = AgentFile(agent, preset("cpu"), lambda: {"env_steps": 0})
+    >>> content = file.state_dict()
+    >>> content["config"]["preset"], content["observation_dim"], content["counters"]
+    ('cpu', 3, {'env_steps': 0})
     """
 
     def __init__(self, agent: Agent, config: TrainConfig, counters: Callable[[], Mapping[str, int | float]]) -> None:
@@ -72,6 +79,16 @@ class BestAgent:
     Args:
         agent (AgentFile): the agent that trains.
         path (Path): the file.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.training import build_agent, preset
+    >>> agent = build_agent(preset("cpu"), observation_dim=3, action_dim=1)
+    >>> file = AgentFile(agent, preset("cpu"), lambda: {"env_steps": 0})
+    >>> best = BestAgent(file, Path(tempfile.mkdtemp()) / "best.pt")
+    >>> best.note(200.0)
+    >>> best.note(150.0)  # worse: the file stays
+    >>> best.return_mean, best.path.exists()
+    (200.0, True)
     """
 
     def __init__(self, agent: AgentFile, path: Path) -> None:

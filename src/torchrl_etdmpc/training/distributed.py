@@ -101,6 +101,16 @@ class WorkerCollector:
 
     Raises:
         ImportError, OSError, ValueError: if there is no Ray, or not the cluster that is asked for.
+
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> from torchrl_etdmpc.training import build_agent, build_replay, preset
+    >>> config = DistributedConfig.from_dict(preset("cpu").to_dict() | {"task": "gym/Pendulum-v1", "workers": 2})
+    >>> agent = build_agent(config, observation_dim=3, action_dim=1)
+    >>> options = {"replay_buffer": build_replay(config), "exclude_keys": ()}
+    >>> collector = WorkerCollector(config, agent, make_env(config.task), **options)
+    >>> collector.frames, collector.in_seed_phase  # the first act() starts the workers
+    (0, True)
+    >>> collector.shutdown()
     """
 
     def __init__(

@@ -115,6 +115,16 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
         RunInterrupted: if a signal asked the run to stop; the text says whether it is saved.
         ValueError, OSError, RuntimeError: if something is wrong with the command or its directory. A run that made no
             step leaves nothing behind.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.training import preset
+    >>> short = {"total_env_steps": 20, "episode_length": 10, "replay": {"seed_decisions": 19, "pretrain_updates": 0}}
+    >>> more = {"task": "gym/Pendulum-v1", "compile": "off", "eval_episodes": 1, "run_dir": tempfile.mkdtemp()}
+    >>> config = TrainConfig.from_dict(preset("cpu").to_dict() | short | more)
+    >>> launch(config)
+    'gym/Pendulum-v1: return ... after 20 env steps in ... s; curve, tables and checkpoint are in ...'
+    >>> RunDirectory(config.run_dir).finished
+    True
     """
     plan = plan_launch(config, explicit)
     if plan.action == "nothing":

@@ -48,6 +48,18 @@ class TrainingRun:
 
     Raises:
         ValueError: if a setting is out of range.
+
+    >>> import tempfile
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> from torchrl_etdmpc.training import preset
+    >>> config = TrainConfig.from_dict(preset("cpu").to_dict() | {"task": "gym/Pendulum-v1", "eval_episodes": 2})
+    >>> env, eval_env = make_env(config.task), make_env(config.task, num_envs=2, parallel=False)
+    >>> log = RunLog(RunDirectory(tempfile.mkdtemp()), total_env_steps=config.total_env_steps)
+    >>> run = TrainingRun(config, env=env, eval_env=eval_env, log=log)  # run.run() trains
+    >>> run.env_steps, list(run.parts)[:2]
+    (0, ['agent', 'best'])
+    >>> run.learner.collector.shutdown()
+    >>> run.evaluator.close()
     """
 
     def __init__(
