@@ -1,14 +1,17 @@
 """Ranges of what ``train.csv`` says early in runs that learned, for the page on runs that do not.
 
-    python benchmarks/early_markers.py "walker-walk=runs/a/walker-walk" "Pendulum=runs/b"
+    python benchmarks/early_markers.py                          # of the committed runs
+    python benchmarks/early_markers.py mine=runs/mine           # the same of your own, to compare with
 
-Each argument is a name and a folder with run directories below it. The rows between 5,000 and 12,000 env steps count.
-Writes ``benchmarks/results/cpu/early_markers.csv``: of each marker the lowest, median and highest row of all runs.
+An argument is a name and a folder with run directories below it. The rows between 5,000 and 12,000 env steps count: of each
+marker the lowest, median and highest row of all runs. Without arguments it writes
+``benchmarks/results/cpu/early_markers.csv``; with arguments it prints the same table.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import sys
 from pathlib import Path
 
@@ -29,27 +32,54 @@ MARKERS = (
     "updates_skipped",
 )
 FIRST, LAST = 5_000, 12_000
-OUT = Path(__file__).parent / "results" / "cpu" / "early_markers.csv"
+RESULTS = Path(__file__).resolve().parent / "results" / "cpu"
+OUT = RESULTS / "early_markers.csv"
+COMMITTED = {
+    "Pendulum-v1": RESULTS / "distributed" / "one-process",
+    "InvertedPendulum-v5": RESULTS / "termination-head" / "head and partial slices",
+    "walker-walk (width 128)": RESULTS / "width-128" / "walker-walk",
+    "reacher-easy (width 128)": RESULTS / "width-128" / "reacher-easy",
+}
 
 
-def main(arguments: list[str]) -> None:
+def ranges(folders: dict[str, Path]) -> str:
+    """The table, as CSV.
+
+    Raises:
+        ValueError: if a folder holds no runs, or none that came far enough.
+    """
     rows = []
-    for argument in arguments:
-        name, _, folder = argument.partition("=")
-        tables = [path for path in sorted(Path(folder).rglob("train.csv")) if (path.parent / "eval.csv").is_file()]
+    for name, folder in folders.items():
+        tables = [path for path in sorted(folder.rglob("train.csv")) if (path.parent / "eval.csv").is_file()]
         if not tables:
-            sys.exit(f"error: {folder!r} must hold run directories with a train.csv.")
+            raise ValueError(f"{str(folder)!r} must hold run directories with a train.csv.")
         frames = [pd.read_csv(path) for path in tables]
         early = pd.concat([frame[frame["env_steps"].between(FIRST, LAST)] for frame in frames])
+        if early.empty:
+            raise ValueError(f"the runs in {str(folder)!r} have no row between {FIRST:,} and {LAST:,} env steps.")
         finals = [pd.read_csv(path.parent / "eval.csv")["return_mean"].iloc[-1] for path in tables]
         for marker in MARKERS:
             values = early[marker].dropna()
             low, median, high = (f"{values.quantile(share):.4g}" for share in (0, 0.5, 1))
             rows.append([name, marker, low, median, high, len(tables), f"{sum(finals) / len(finals):.1f}"])
-    with open(OUT, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["runs", "marker", "low", "median", "high", "seeds", "final_return"])
-        writer.writerows(rows)
+    memory = io.StringIO()
+    writer = csv.writer(memory, lineterminator="\n")
+    writer.writerow(["runs", "marker", "low", "median", "high", "seeds", "final_return"])
+    writer.writerows(rows)
+    return memory.getvalue()
+
+
+def main(arguments: list[str]) -> None:
+    """Writes the committed runs' table, or prints that of the folders that are named."""
+    own = {name: Path(folder) for name, _, folder in (argument.partition("=") for argument in arguments)}
+    try:
+        text = ranges(own or COMMITTED)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    if own:
+        print(text, end="")
+        return
+    OUT.write_text(text, encoding="utf-8")
     print(f"wrote {OUT}")
 
 

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -108,6 +109,22 @@ def test_the_ranges_of_the_markers_are_those_of_the_file(generate):
     text = generate.markers()
     assert "| `plan_fallbacks` | 0 to 0 |" in text
     assert len(text.splitlines()) > 10
+
+
+def test_the_markers_are_those_of_the_committed_runs():
+    markers = runpy.run_path(str(ROOT / "benchmarks" / "early_markers.py"))
+    assert markers["ranges"](markers["COMMITTED"]) == markers["OUT"].read_text(encoding="utf-8")
+
+
+def test_the_markers_of_one_s_own_runs_are_printed_and_a_folder_without_any_is_named(tmp_path, capsys):
+    markers = runpy.run_path(str(ROOT / "benchmarks" / "early_markers.py"))
+    before = markers["OUT"].read_bytes()
+    (own,) = markers["COMMITTED"]["walker-walk (width 128)"].glob("seed1")
+    markers["main"]([f"mine={own}"])
+    assert "mine,plan_fallbacks,0,0,0,1," in capsys.readouterr().out
+    assert markers["OUT"].read_bytes() == before
+    with pytest.raises(SystemExit, match="must hold run directories with a train.csv"):
+        markers["main"]([f"mine={tmp_path}"])
 
 
 def test_the_commands_explain_themselves(generate):
