@@ -3,8 +3,8 @@
     python benchmarks/early_markers.py                          # of the committed runs
     python benchmarks/early_markers.py mine=runs/mine           # the same of your own, to compare with
 
-An argument is a name and a folder with run directories below it. The rows between 5,000 and 12,000 env steps count: of each
-marker the lowest, median and highest row of all runs. Without arguments it writes
+An argument is a name and a folder with run directories below it. The rows between 5,000 and 12,000 env steps count: the
+lowest, median and highest of each marker over all runs. Without arguments it writes
 ``benchmarks/results/cpu/early_markers.csv``; with arguments it prints the same table.
 """
 

@@ -86,6 +86,12 @@ def test_the_last_of_two_values_counts(run_command):
     assert run_command("seed=2", "seed=3").seed == 3
 
 
+def test_a_flag_may_stand_between_settings(run_command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a sweep of Hydra's keeps a folder
+    assert "horizon: 4" in run_command("preset=cpu", "--cfg", "job", "planner.horizon=4")
+    assert run_command("preset=cpu", "--multirun", "seed=3,4").seed == 3
+
+
 def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):
     assert "usage: command [SETTING=VALUE ...]" in run_command("--help")
     assert "planner.horizon=3 " in run_command("--help", "planner", "preset=cpu")

@@ -161,16 +161,16 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
     """
     settings, groups = settings_of(config_class), groups_of(config_class)
     sweep = bool({"--multirun", "-m"} & set(arguments))
-    checked, rest = [], iter(arguments)
+    flags, checked, rest = [], [], iter(arguments)
     for argument in rest:
         bare = argument.lstrip("-")
         if argument in _FLAGS:
-            checked.append(argument)
+            flags.append(argument)
             if argument in ("--cfg", "-c"):
                 what = next(rest, "")
                 if what != "job":
                     raise ValueError(f"{argument} must be followed by job, got {what!r}.")
-                checked.append(what)
+                flags.append(what)
             continue
         name, equals, value = bare.lstrip("+").partition("=")
         if argument.startswith("-") and not (equals or bare in settings):
@@ -198,9 +198,9 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
         checked.append(f"{short}={value if sweep else _readable(settings[name], value)}")
     given = {argument.partition("=")[0] for argument in checked}
     for name, setting in settings.items():
-        if setting.default is dataclasses.MISSING and name not in given and "--cfg" not in given:
+        if setting.default is dataclasses.MISSING and name not in given and not {"--cfg", "-c"} & set(flags):
             raise ValueError(f"{name}=... is missing: {setting.meaning[0].lower()}{setting.meaning[1:]}")
-    return checked
+    return flags + checked  # Hydra takes no flag between settings
 
 
 def _readable(setting: Setting, value: str) -> str:
