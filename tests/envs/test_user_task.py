@@ -164,6 +164,7 @@ def test_a_task_of_a_file_keeps_its_numbers_and_maker(folder):
             "no.such.file:make",
             r"task 'no\.such\.file:make': there is no module 'no\.such\.file' on Python's path or .*",
         ),
+        ("my_file.py:make", r"task 'my_file\.py:make': there is no module 'my_file\.py' .*; write my_file:make\."),
         ("my_file:other", r"task 'my_file:other': the module 'my_file' \(.*my_file\.py\) has no 'other'\."),
         ("more_tasks:VALUE", r"task 'more_tasks:VALUE' must be a function or a Task, got int\."),
         ("more_tasks:number", r"task 'more_tasks:number' must return a TorchRL environment, got int\."),

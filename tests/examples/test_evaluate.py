@@ -207,6 +207,21 @@ def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, m
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_film_that_cannot_be_written_is_an_error_before_the_episodes(
+    run_main, checkpoint, tmp_path, monkeypatch: pytest.MonkeyPatch
+):
+    from torchrl_etdmpc.commands import evaluate as command
+
+    played = []
+    monkeypatch.setattr(command, "render_frame", lambda env, *size: torch.zeros(32, 32, 3, dtype=torch.uint8))
+    monkeypatch.setattr(command, "evaluate", lambda *arguments, **options: played.append(arguments))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # not installed
+    error, out, err = run_main(f"checkpoint={checkpoint}", "video=film.mp4", "policy=bare", "device=cpu")
+    assert error == "error: write_mp4 needs imageio-ffmpeg, which is not installed; run `pip install imageio-ffmpeg`."
+    assert (played, out, err) == ([], "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
 # Runs the script with frames that are quickly drawn.
 SMALL_FRAMES = """
 import functools, runpy, sys

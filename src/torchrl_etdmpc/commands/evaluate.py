@@ -17,6 +17,7 @@ from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
+from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
 
 GIF_SIZE = 200  # pixels, for a page
@@ -80,7 +81,9 @@ def main(config: EvaluateConfig) -> None:
 
     if config.video:
         env.reset()
-        render_frame(env, *size)  # fails here, before the episodes, if this machine cannot render
+        # Fails here, before the episodes, if this machine cannot render or lacks what writes a film.
+        render_frame(env, *size)
+        film_writer(config.video)
     played = evaluate(
         env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
     )

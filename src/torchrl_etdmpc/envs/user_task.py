@@ -101,8 +101,9 @@ def import_attribute(path: str, setting: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # the user's module was found, and misses another one
+        hint = f"; write {module_name[:-3]}:{attribute}" if module_name.endswith(".py") else ""
         raise ValueError(
-            f"{setting} {path!r}: there is no module {module_name!r} on Python's path or in {here}."
+            f"{setting} {path!r}: there is no module {module_name!r} on Python's path or in {here}{hint}."
         ) from error
     found = getattr(module, attribute, None)
     if found is None:

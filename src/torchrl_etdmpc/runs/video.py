@@ -42,10 +42,7 @@ def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathL
         return write_mp4(frames, path, fps)
     if not fps > 0:
         raise ValueError(f"fps must be above 0, got {fps}; 30 is usual.")
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("a GIF needs Pillow, which is not installed; run `pip install pillow`.") from error
+    Image = film_writer(path)
     kept, shape = [], None
     for index, frame in enumerate(frames):
         array = _check_frame(frame, index, shape)
@@ -66,6 +63,30 @@ def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathL
     except OSError as error:
         raise OSError(f"path={path} cannot be written ({error.strerror}); choose another path.") from error
     return path
+
+
+def film_writer(path: str | os.PathLike[str]) -> Any:
+    """The library that writes a film of this name.
+
+    Raises:
+        ImportError: if it is not installed.
+
+    >>> film_writer("episode.gif").__name__
+    'PIL.Image'
+    """
+    if Path(path).suffix == ".gif":
+        try:
+            from PIL import Image
+        except ImportError as error:
+            raise ImportError("a GIF needs Pillow, which is not installed; run `pip install pillow`.") from error
+        return Image
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(
+            "write_mp4 needs imageio-ffmpeg, which is not installed; run `pip install imageio-ffmpeg`."
+        ) from error
+    return imageio_ffmpeg
 
 
 def write_mp4(
@@ -100,13 +121,7 @@ def write_mp4(
         raise ValueError(f"path must end in .mp4, got {path}; rename it.")
     if not fps > 0:
         raise ValueError(f"fps must be above 0, got {fps}; 30 is usual.")
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ImportError(
-            "write_mp4 needs imageio-ffmpeg, which is not installed; run `pip install imageio-ffmpeg`."
-        ) from error
-
+    imageio_ffmpeg = film_writer(path)
     iterator = iter(frames)
     first = next(iterator, None)
     if first is None:
