@@ -253,3 +253,39 @@ def test_the_coefficient_weighs_divergence_and_entropy_once(make_world_model, ma
     torch.testing.assert_close(seven["loss_policy"], 7 * one["loss_policy"])
     for metric in ("policy_kl", "policy_entropy", "kl_scale"):
         assert seven[metric] == one[metric]
+
+
+@pytest.mark.parametrize("kind", ["policy", "whole"])
+def test_a_step_without_a_plan_has_no_error_and_moves_no_scale(make_loss, make_slices, gradients, kind):
+    slices = make_slices(num_slices=30)
+    loss = make_loss(kind, reduction="none", scale_tau=0.5)
+    planned = torch.rand(slices.shape) < 0.6
+    planned[:5, 0] = True
+    expected = loss(slices[planned[:, 0]])["kl_scale"]
+    errors = loss.eval()(slices)["loss_policy"]
+    loss.train().kl_scale.fill_(1)
+    for entry in slices["plan"].values():
+        entry[~planned] = 0  # as a collector fills what its random policy does not write
+    out = loss(slices)
+    torch.testing.assert_close(out["kl_scale"], expected)
+    assert not out["loss_policy"][~planned].any()
+    torch.testing.assert_close(out["loss_policy"][planned], errors[planned])
+    policy = [*loss.world_model.policy.parameters()]
+    found = torch.autograd.grad(out["loss_policy"].sum(), policy)
+    slices["plan", "loc"][~planned], slices["plan", "scale"][~planned] = 0.5, 2.0
+    wanted = torch.autograd.grad(loss.eval()(slices)["loss_policy"][planned].sum(), policy)
+    torch.testing.assert_close(found, wanted)
+
+
+def test_a_batch_without_plans_is_a_policy_loss_of_zero(make_loss, slices):
+    loss = make_loss("policy")
+    _set_plan(slices, torch.zeros(3), torch.zeros(3))
+    out = loss(slices)
+    out["loss_policy"].backward()
+    assert (out["loss_policy"], out["policy_kl"], out["kl_scale"]) == (0, 0, 1)
+    assert not any(parameter.grad.any() for parameter in loss.world_model.policy.parameters())
+
+
+def test_a_scale_that_is_no_number_is_not_taken_for_a_missing_plan(make_loss, slices):
+    slices["plan", "scale"][0, 0, 1] = torch.nan
+    assert make_loss("policy")(slices)["loss_policy"].isnan()

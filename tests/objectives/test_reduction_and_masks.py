@@ -225,3 +225,24 @@ def test_the_padded_trajectories_of_torchrl_s_collector_train_the_agent(make_los
     torch.manual_seed(0)
     assert torch.equal(loss(junk)["loss_policy"], expected["loss_policy"])
     assert reference["policy_kl"].isfinite()
+
+
+@pytest.mark.filterwarnings("ignore:.*auto_register_policy_transforms.*:FutureWarning")
+def test_random_frames_of_torchrl_s_collector_leave_the_policy_finite(make_loss, make_world_model, total):
+    model = make_world_model(observation_dim=3, action_dim=1)
+    planner = EnsembleMPPIPlanner(
+        LatentEnv(model), horizon=2, num_samples=8, num_elites=2, num_proposals=1, iterations=1
+    )
+    frames = {"frames_per_batch": 30, "total_frames": 60, "init_random_frames": 30}
+    collector = Collector(make_env("gym/Pendulum-v1", seed=0), planner, **frames, auto_register_policy_transforms=True)
+    random_frames, planned_frames = (frames.clone().unflatten(0, (-1, 3)) for frames in collector)
+    collector.shutdown()
+    assert not random_frames["plan", "scale"].any()
+    assert planned_frames["plan", "scale"].all()
+    loss = make_loss("whole", model)
+    out = loss(torch.cat([random_frames, planned_frames]))
+    total(out).backward()
+    assert all(value.isfinite() for value in out.values())
+    assert all(parameter.grad.isfinite().all() for parameter in model.parameters() if parameter.grad is not None)
+    assert model.policy.output.weight.grad.any()
+    torch.testing.assert_close(out["policy_kl"], loss.eval()(planned_frames)["policy_kl"])

@@ -10,7 +10,13 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.latent_rollout import (
+    LatentRollout,
+    Slices,
+    counted_mean,
+    head_rows,
+    mean_of_head_rows,
+)
 from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term
 
 
@@ -65,7 +71,8 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
 
     On the detached rollout latents, ``KL(pi || plan) / S - entropy_coef * entropy * A`` with the KL averaged over
     action dimensions; S is a running scale of the KL (5th to 95th percentile at k = 0, at least 1), moved only
-    in training mode. Trains the policy alone.
+    in training mode. Trains the policy alone. A step without a plan, whose ``plan_scale`` is zero as that of a
+    collector's random frames is, has no error here.
 
     Args:
         world_model (WorldModel): the networks, shared with the caller.
@@ -136,14 +143,17 @@ def _policy(
     assert slices.plan_loc is not None and slices.plan_scale is not None
     heads = world_model.num_dynamics
     latent = head_rows(rollout.predicted[:-1])
-    plan = head_rows(slices.plan_loc, heads), head_rows(slices.plan_scale, heads)
+    # Random actions of a collector have no plan, and zeros in its place: a scale of zero would make every gradient NaN.
+    planned = (slices.plan_scale != 0).any(-1)
+    plan_scale = torch.where(planned.unsqueeze(-1), slices.plan_scale, 1)
+    plan = head_rows(slices.plan_loc, heads), head_rows(plan_scale, heads)
     kl, entropy = distillation(world_model, latent, *plan, kl_direction=loss.kl_direction)
-    first = None if slices.counts is None else slices.counts[0]
+    counts = planned if slices.counts is None else planned & slices.counts
     # Departure from BMPC, which moves the scale in every policy step: an evaluation of the loss must not change it.
     if loss.training:
-        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau, first))
+        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau, counts[0]))
     scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
     error = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
-    policy_kl, policy_entropy = (mean_of_head_rows(value, heads) for value in (kl, entropy))
+    policy_kl, policy_entropy = (counted_mean(mean_of_head_rows(value, heads), counts) for value in (kl, entropy))
     metrics = {"policy_kl": policy_kl, "policy_entropy": policy_entropy, "kl_scale": scale}
-    return mean_of_head_rows(error, heads), metrics
+    return torch.where(planned, mean_of_head_rows(error, heads), 0), metrics
