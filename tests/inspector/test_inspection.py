@@ -124,6 +124,16 @@ def test_a_plan_can_be_given_up_and_another_one_gives_it_up(inspection):
     assert inspection.traces[following.future.result()].manifest["state"]["step"] == 1
 
 
+def test_a_trace_that_others_are_drawn_like_is_kept(inspection):
+    job = inspection.start(State(0, 0), {})
+    assert job.wait(10)
+    held = job.future.result()
+    for seed in range(20):  # more than are kept
+        last = inspection.plan(State(0, 0), like=held, seed=seed)
+    assert held in inspection.traces
+    assert np.array_equal(last["basis"], inspection.traces[held]["basis"])
+
+
 def test_an_episode_can_be_played_by_the_policy():
     inspection = Inspection(make(), TASK, steps=3, bare=True)
     trace = inspection.plan(State(0, 2))

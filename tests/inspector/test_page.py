@@ -165,6 +165,17 @@ class Page:
         found = self.driver.execute_script(script, name)
         return [trace for trace in found if kind is None or trace["name"] == kind]
 
+    def rings(self, graph: str) -> list[dict[str, Any]]:
+        """Shapes around a clicked candidate, as they are drawn."""
+        script = """
+            const graph = document.getElementById(arguments[0]);
+            const drawn = graph.classList.contains('js-plotly-plot') ? graph : graph.querySelector('.js-plotly-plot');
+            const paths = drawn.querySelectorAll('.shapelayer path').length;
+            return (drawn._fullLayout.shapes || []).map(shape => ({xref: shape.xref, x: shape.xanchor,
+                y: shape.yanchor, paths: paths}));
+        """
+        return self.driver.execute_script(script, graph)
+
     def text(self, name: str) -> str:
         return self.driver.find_element("id", name).text
 
@@ -187,7 +198,7 @@ class Page:
             ActionChains(self.driver).move_to_element(point).pause(0.3).click().perform()
             end = time.monotonic() + 5
             while time.monotonic() < end:
-                rings = self.traces(graph, "clicked")
+                rings = self.rings(graph)
                 if rings:
                     return rings
         pytest.fail("no click reached a candidate")
@@ -246,7 +257,8 @@ def shows(page: Page, trace: Any, side: str, iteration: int) -> bool:
 
 def candidate_at(page: Page, rings: list[dict[str, Any]]) -> int:
     """The candidate in the middle of a ring in the first head's panel."""
-    middle = np.array([rings[0]["x"][0], rings[0]["y"][0]])
+    assert [ring["xref"] for ring in rings] == ["x", "x2"] and rings[0]["paths"] == 2
+    middle = np.array([rings[0]["x"], rings[0]["y"]])
     for kind in ("candidate", "elite", "proposal"):
         marks = page.traces("latent_plane-a", kind)[0]
         away = np.abs(np.stack([marks["x"], marks["y"]], 1) - middle).max(1)
@@ -262,10 +274,12 @@ def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
     from selenium.webdriver.common.keys import Keys
 
     page.driver.get(served.address)
+    # Both this thread and the page's play the episode with torch's one generator: one after the other.
+    wait_for(lambda: page.driver.find_elements("css selector", "#described-a li"), "the first state")
+    assert "episode 0, step 0" in page.text("described-a")
     first = expected(0)
     assert np.ptp(first["scores"][-1]) > 1e-2  # or any numbers would do
     wait_for(lambda: shows(page, first, "a", -1), "the plan of the first state")
-    assert "episode 0, step 0" in page.text("described-a")
     assert f"{float(first['value']):.3f}" in page.text("described-a")
 
     frames = wait_for(lambda: page.driver.find_elements("css selector", "#strip button"), "the filmstrip")
@@ -287,7 +301,9 @@ def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
     table = chosen["returns"][1, candidate].reshape(3, -1)
     wait_for_numbers(lambda: page.traces("return_table-a")[0]["z"], table, "its return table")
     page.click("unclick")
-    wait_for(lambda: not page.traces("latent_plane-a", "clicked"), "the chosen sequence again")
+    wait_for(lambda: not page.rings("latent_plane-a"), "the chosen sequence again")
+    table = chosen["chosen_returns"].reshape(3, -1)
+    wait_for_numbers(lambda: page.traces("return_table-a")[0]["z"], table, "its return table again")
 
     page.push("iteration", Keys.END)
     wait_for(lambda: shows(page, chosen, "a", -1), "the last iteration again")

@@ -185,12 +185,15 @@ class Inspection:
             raise Cancelled("cancelled; the plan before is still shown.")
         observation, plan_mean, place, about = self._state(job, state)
         job.begin("planning")
+        held = None if like is None else self.traces.get(like)
+        if held is not None:
+            self.traces.move_to_end(like)  # it is still looked at
         trace = trace_plan(
             planner,
             observation,
             plan_mean=plan_mean,
             seed=seed,
-            like=None if like is None else self.traces.get(like),
+            like=held,
             progress=job.tell,
             **self.about,
             **about,

@@ -1,6 +1,7 @@
-// The theme: the toggle overrides the system's choice and is kept by this browser.
+// What a served and a saved page have in common: the theme, and the ring around a clicked candidate.
 (function () {
   "use strict";
+  // The toggle overrides the system's choice and is kept by this browser.
   function show(theme) {
     if (theme) { document.documentElement.setAttribute("data-theme", theme); }
   }
@@ -14,4 +15,19 @@
     show(next);
     try { localStorage.setItem("inspector-theme", next); } catch (error) { /* likewise */ }
   });
+
+  // A shape of the layout, which is moved without drawing a mark anew; none around no candidate.
+  window.moveRing = function (graph, candidate) {
+    var rings = [];
+    if (!graph || !graph.data || !graph.layout.meta) { return; }
+    graph.data.forEach(function (trace) {
+      var place = candidate === null || !trace.customdata ? -1 : trace.customdata.indexOf(candidate);
+      if (place >= 0) {
+        rings.push(Object.assign({}, graph.layout.meta.ring, {
+          xref: trace.xaxis, yref: trace.yaxis, xanchor: trace.x[place], yanchor: trace.y[place]
+        }));
+      }
+    });
+    if (rings.length || (graph.layout.shapes || []).length) { Plotly.relayout(graph, { shapes: rings }); }
+  };
 })();
