@@ -128,8 +128,7 @@ def test_a_trace_that_others_are_drawn_like_is_kept(inspection):
     job = inspection.start(State(0, 0), {})
     assert job.wait(10)
     held = job.future.result()
-    for seed in range(20):  # more than are kept
-        last = inspection.plan(State(0, 0), like=held, seed=seed)
+    *_, last = (inspection.plan(State(0, 0), like=held, seed=seed) for seed in range(20))  # more than are kept
     assert held in inspection.traces
     assert np.array_equal(last["basis"], inspection.traces[held]["basis"])
 

@@ -185,8 +185,9 @@ class Inspection:
             raise Cancelled("cancelled; the plan before is still shown.")
         observation, plan_mean, place, about = self._state(job, state)
         job.begin("planning")
-        held = None if like is None else self.traces.get(like)
-        if held is not None:
+        held = None
+        if like is not None and like in self.traces:
+            held = self.traces[like]
             self.traces.move_to_end(like)  # it is still looked at
         trace = trace_plan(
             planner,

@@ -158,7 +158,7 @@ def _plain(drawing: figures.Drawing) -> Any:
     """A drawing without arrays and numbers that JSON does not have."""
     from plotly.io.json import to_json_plotly
 
-    return json.loads(to_json_plotly(drawing))
+    return json.loads(str(to_json_plotly(drawing)))
 
 
 def _side(trace: Trace) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def latent_plane(
         if candidate is not None:
             x, y = where[candidate].tolist()
             rings.append(_ring() | {"xref": f"x{number}", "yref": f"y{number}", "xanchor": x, "yanchor": y})
-    layout = _panels(trace, axes, scores) | {"shapes": rings}
+    layout: dict[str, Any] = _panels(trace, axes, scores) | {"shapes": rings}
     for direction in "xy":
         layout[f"{direction}axis"]["range"] = _around([mark[direction] for mark in data])
     return {"data": data, "layout": layout}
