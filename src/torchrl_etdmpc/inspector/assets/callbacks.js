@@ -25,6 +25,9 @@ window.dash_clientside = Object.assign({}, window.dash_clientside, {
       });
     },
 
+    // Of a second plan beside the first.
+    fit: function () { requestAnimationFrame(fitFigures); },
+
     ring: function (candidate, plane) {
       moveRing(document.getElementById(plane).querySelector(".js-plotly-plot"), candidate);
     }

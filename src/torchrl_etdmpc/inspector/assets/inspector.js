@@ -1,4 +1,4 @@
-// What a served and a saved page have in common: the theme, and the ring around a clicked candidate.
+// What a served and a saved page have in common: the theme, the width of figures, the ring around a candidate.
 (function () {
   "use strict";
   // The toggle overrides the system's choice and is kept by this browser.
@@ -15,6 +15,18 @@
     show(next);
     try { localStorage.setItem("inspector-theme", next); } catch (error) { /* likewise */ }
   });
+
+  // Figures take the width that there is. Their height is their own: following that too, as plotly's and dash's own
+  // ways do, every figure that is drawn resizes those beside it, and they each other.
+  window.fitFigures = function () {
+    document.querySelectorAll(".js-plotly-plot").forEach(function (graph) {
+      var drawn = graph.querySelector(".main-svg"), width = graph.clientWidth;
+      if (drawn && width && Math.abs(drawn.getAttribute("width") - width) > 1) {
+        Plotly.relayout(graph, { width: width });
+      }
+    });
+  };
+  new ResizeObserver(function () { requestAnimationFrame(fitFigures); }).observe(document.documentElement);
 
   // A shape of the layout, which is moved without drawing a mark anew; none around no candidate.
   window.moveRing = function (graph, candidate) {

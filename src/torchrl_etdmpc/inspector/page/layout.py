@@ -9,7 +9,7 @@ from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page.controls import controls
 from torchrl_etdmpc.inspector.saved_page import WIDE
 
-_GRAPH: Any = {"displayModeBar": False, "responsive": True}
+_GRAPH: Any = {"displayModeBar": False, "responsive": False}  # inspector.js fits them
 
 
 def page_layout(inspection: Inspection, first: State, folder: str) -> Any:

@@ -117,6 +117,10 @@ def connect_plans(app: Any, inspection: Inspection) -> None:
         Input("depth", "value"),
     )
 
+    app.clientside_callback(
+        ClientsideFunction("inspector", "fit"), Input("main", "className"), prevent_initial_call=True
+    )
+
     @app.callback(
         Output("trace-b", "data"),
         Output("main", "className"),

@@ -2,7 +2,7 @@
 (function () {
   "use strict";
   var state = { iteration: INSPECTION.iterations - 1, candidate: null, side: 0 };
-  var config = { displayModeBar: false, responsive: true };
+  var config = { displayModeBar: false };
 
   function numbers(packed) { // base64 of little-endian float32
     var text = atob(packed), bytes = new Uint8Array(text.length);
