@@ -80,12 +80,14 @@ def test_a_state_that_cannot_be_restored_leaves_the_plan(monkeypatch, inspection
     assert trace.manifest["notes"] == ["The plan was not rolled in the simulator: state cannot be restored exactly."]
 
 
-def test_rows_of_a_replay_buffer_have_no_simulator():
+def test_rows_of_a_replay_buffer_have_no_simulator_and_the_page_says_why():
     rows = torch.randn(5, 3)
     inspection = Inspection(make(), TASK, replay=lambda row: rows[row], rows=5)
     trace = inspection.plan(State(0, 4, replay=True))
     assert np.array_equal(trace["observation"], rows[4].numpy())
-    assert trace.get("real_rewards") is None
+    assert trace.get("real_rewards") is None and trace.get("frames") is None
+    (note,) = trace.manifest["notes"]
+    assert note.startswith("There are no frames, and the plan is not rolled in the simulator: a row of the replay")
     with pytest.raises(ValueError, match=r"the row must be in \[0, 5\), the rows of the replay buffer, got 5"):
         inspection.plan(State(0, 5, replay=True))
     inspection.close()

@@ -21,8 +21,9 @@ pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import get_task  # noqa: E402
 from torchrl_etdmpc.inspector import load_trace, play_episode, trace_plan, with_settings  # noqa: E402
-from torchrl_etdmpc.inspector.inspection import Inspection, State  # noqa: E402
+from torchrl_etdmpc.inspector.inspection import Inspection, State, Strip  # noqa: E402
 from torchrl_etdmpc.inspector.page import make_page, page_settings, serve, slider_range  # noqa: E402
+from torchrl_etdmpc.inspector.saved_page import write_page  # noqa: E402
 from torchrl_etdmpc.inspector.settings import settings_of_class  # noqa: E402
 from torchrl_etdmpc.modules import WorldModel  # noqa: E402
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv  # noqa: E402
@@ -357,6 +358,25 @@ def test_the_theme_is_the_system_s_until_it_is_toggled(page, served):
         assert paper() == colour
         page.click("theme")
         assert paper() == other
+
+
+@pytest.mark.slow
+def test_nothing_is_cut_off_on_paper(page, tmp_path):
+    trace, frame = expected(0), np.zeros((64, 64, 3), np.uint8)
+    saved = write_page(tmp_path / "page", trace, trace, strip=Strip(list(range(30)), [frame] * 30), step=0)
+    page.driver.get(saved.as_uri())
+    wait_for(lambda: shows(page, trace, "b", -1), "the saved plan")
+    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    paper = {"width": 700, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", paper)
+    script = """return Array.from(document.querySelectorAll('.js-plotly-plot'), graph =>
+        [Number(graph.querySelector('.main-svg').getAttribute('width')), graph.clientWidth])"""
+    wait_for(lambda: np.ptp(page.driver.execute_script(script), axis=1).max() <= 1, "figures of the paper's width")
+    assert page.driver.execute_script("return document.documentElement.scrollWidth") <= 700
+    strips = "return Array.from(document.querySelectorAll('.strip'), strip => strip.scrollWidth - strip.clientWidth)"
+    assert max(page.driver.execute_script(strips)) <= 0
+    assert not page.driver.find_element("id", "iteration").is_displayed()
+    assert "3 of 3" in page.text("iteration-value")
 
 
 def test_a_state_to_begin_with_is_planned_first(inspection):

@@ -27,6 +27,7 @@
     });
   };
   new ResizeObserver(function () { requestAnimationFrame(fitFigures); }).observe(document.documentElement);
+  window.matchMedia("print").addEventListener("change", fitFigures);  // at once: paper does not wait
 
   // A shape of the layout, which is moved without drawing a mark anew; none around no candidate.
   window.moveRing = function (graph, candidate) {

@@ -131,7 +131,7 @@ def compare_plans(trace: Trace, other: Trace) -> Drawing:
         "zmin": -widest,
         "zmax": widest,
         "colorscale": [[0, BLUE], [0.5, "#f5f5f5"], [1, VERMILION]],
-        "colorbar": titled("second - first", thickness=12),
+        "colorbar": {"title": {"text": "second - first", "side": "right"}, "thickness": 12},
     }
     if gap.shape[1] <= 12:
         cells["texttemplate"] = "%{z:.2f}"
