@@ -244,25 +244,32 @@ class Hand:
         script = "document.getElementById(arguments[0]).querySelectorAll('input')[arguments[1]].click()"
         return lambda: self.driver.execute_script(script, group, number)
 
-    def click_candidates(self, name: str, graph: str) -> None:
-        """Clicks candidate after candidate with the mouse, which is there before."""
+    def click_candidates(self, name: str, side: str = "a") -> None:
+        """Clicks candidates with the mouse, which is there before; the one that is shown already does not count."""
         from selenium.webdriver import ActionChains
 
-        element = self.driver.find_element("id", graph)
+        element = self.driver.find_element("id", f"latent_plane-{side}")
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
-        points = iter(element.find_elements("css selector", ".scatterlayer .trace path.point")[::7])
-
-        def act() -> None:
-            ActionChains(self.driver).click().perform()
-
-        repeats, self.repeats = self.repeats, 1
-        noted = []
-        for _ in range(repeats):
-            ActionChains(self.driver).move_to_element(next(points)).perform()
-            self.does(name, act)
-            noted.append(self.took.pop(name))
+        repeats, self.repeats, noted = self.repeats, 1, []
+        for point in element.find_elements("css selector", ".scatterlayer .trace path.point")[::5]:
+            ActionChains(self.driver).move_to_element(point).perform()
+            before = self.table(side)
+            self.does(name, ActionChains(self.driver).click().perform)
+            entry = self.took.pop(name)
+            if self.table(side) != before:
+                noted.append(entry)
+            if len(noted) == repeats:
+                break
+        assert len(noted) == repeats, "too few clicks reached a candidate"
         self.repeats = repeats
         self.note(name, *([entry[key] for entry in noted] for key in ("median_s", "page_cpu_s", "server_cpu_s")))
+
+    def table(self, side: str) -> str:
+        """The title of the return table, which names the candidate."""
+        script = """
+            const graph = document.getElementById(arguments[0]);
+            return (graph.layout || graph.querySelector('.js-plotly-plot').layout).title.text"""
+        return self.driver.execute_script(script, f"return_table-{side}")
 
 
 def by_hand(driver: Any, inspection: Inspection, folder: Path, repeats: int) -> dict[str, dict[str, Any]]:
@@ -288,7 +295,7 @@ def by_hand(driver: Any, inspection: Inspection, folder: Path, repeats: int) -> 
 
         def scrubs(beside: str = "") -> None:
             hand.does("an iteration is scrubbed" + beside, *(hand.push("iteration", key) for key in back_and_on))
-            hand.click_candidates("a candidate is clicked" + beside, "latent_plane-a")
+            hand.click_candidates("a candidate is clicked" + beside)
 
         scrubs()
         hand.press("unclick")()
@@ -308,7 +315,7 @@ def by_hand(driver: Any, inspection: Inspection, folder: Path, repeats: int) -> 
         assert (folder / "index.html").exists()
         hand.open("a saved page opens", (folder / "index.html").as_uri())
         hand.does("an iteration is scrubbed in it", *(hand.push("iteration", key) for key in back_and_on))
-        hand.click_candidates("a candidate is clicked in it", "latent_plane-a")
+        hand.click_candidates("a candidate is clicked in it")
     finally:
         stop()
         thread.join()

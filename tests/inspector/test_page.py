@@ -177,6 +177,18 @@ class Page:
         """
         return self.driver.execute_script(script, graph)
 
+    def count_drawn(self, graph: str) -> None:
+        """Counts in ``window.drawn`` how often a figure is drawn as a whole from now on."""
+        script = """
+            const react = Plotly.react;
+            window.drawn = 0;
+            Plotly.react = (graph, ...rest) => {
+                window.drawn += graph.parentElement.id === arguments[0] ? 1 : 0;
+                return react(graph, ...rest);
+            };
+        """
+        self.driver.execute_script(script, graph)
+
     def text(self, name: str) -> str:
         return self.driver.find_element("id", name).text
 
@@ -297,10 +309,12 @@ def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
     means = chosen["mean"][1, :, 0]
     wait_for_numbers(lambda: page.traces("plan_gaussian-a", "a1")[0]["y"], means, "the mean of that iteration")
 
+    page.count_drawn("latent_plane-a")
     clicked = page.click_candidate("latent_plane-a")
     candidate = candidate_at(page, clicked)
     table = chosen["returns"][1, candidate].reshape(3, -1)
     wait_for_numbers(lambda: page.traces("return_table-a")[0]["z"], table, "its return table")
+    assert page.driver.execute_script("return window.drawn") == 0  # the ring is moved, the candidates stay
     page.click("unclick")
     wait_for(lambda: not page.rings("latent_plane-a"), "the chosen sequence again")
     table = chosen["chosen_returns"].reshape(3, -1)

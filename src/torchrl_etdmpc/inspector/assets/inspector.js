@@ -41,6 +41,8 @@
         }));
       }
     });
-    if (rings.length || (graph.layout.shapes || []).length) { Plotly.relayout(graph, { shapes: rings }); }
+    if (rings.length || (graph.layout.shapes || []).length) {
+      Plotly.update(graph, {}, { shapes: rings });  // of Plotly.relayout dash hears, and draws the whole figure again
+    }
   };
 })();
