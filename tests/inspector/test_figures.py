@@ -52,7 +52,27 @@ def test_the_plane_marks_the_chosen_the_real_and_the_clicked(trace):
         assert drawn(figure, "chosen")[head].x[-1] == trace["chosen_points"][-1, head, 0]
         assert drawn(figure, "chosen")[head].x[0] == trace["start_point"][0]
         assert np.array_equal(drawn(figure, "simulator")[head].y, trace["real_points"][:, 1])
-        assert drawn(figure, "clicked")[head].x[0] == trace["points"][-1, 7, -1, head, 0]
+        ring = figure.layout.shapes[head]
+        assert (ring.name, ring.xref, ring.yref) == (("clicked", "x", "y"), ("clicked", "x2", "y2"))[head]
+        assert np.array_equal([ring.xanchor, ring.yanchor], trace["points"][-1, 7, -1, head, :2])
+    assert not figures.latent_plane(trace).layout.shapes
+
+
+def test_the_plane_s_axes_hold_all_that_it_shows(trace):
+    figure = figures.latent_plane(trace, 0, components=(1, 2))
+    for axis, name in ((figure.layout.xaxis, "x"), (figure.layout.yaxis, "y")):
+        shown = np.concatenate([each[name] for each in figure.data])
+        low, high = axis.range
+        assert low < shown.min() and shown.max() < high
+        assert high - low < 1.2 * np.ptp(shown)
+
+
+def test_a_figure_is_drawn_as_plain_dictionaries_without_plotly_s_checks(trace):
+    for name in figures.FIGURES:
+        figure = getattr(figures, name)
+        plain = figures.plain(figure)(trace)
+        assert isinstance(plain, dict)
+        assert [each.name for each in figure(trace).data] == [each.get("name") for each in plain["data"]]
 
 
 def test_the_return_table_is_that_of_the_candidate(trace):

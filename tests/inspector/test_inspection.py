@@ -80,12 +80,14 @@ def test_a_state_that_cannot_be_restored_leaves_the_plan(monkeypatch, inspection
     assert trace.manifest["notes"] == ["The plan was not rolled in the simulator: state cannot be restored exactly."]
 
 
-def test_rows_of_a_replay_buffer_have_no_simulator():
+def test_rows_of_a_replay_buffer_have_no_simulator_and_the_page_says_why():
     rows = torch.randn(5, 3)
     inspection = Inspection(make(), TASK, replay=lambda row: rows[row], rows=5)
     trace = inspection.plan(State(0, 4, replay=True))
     assert np.array_equal(trace["observation"], rows[4].numpy())
-    assert trace.get("real_rewards") is None
+    assert trace.get("real_rewards") is None and trace.get("frames") is None
+    (note,) = trace.manifest["notes"]
+    assert note.startswith("There are no frames, and the plan is not rolled in the simulator: a row of the replay")
     with pytest.raises(ValueError, match=r"the row must be in \[0, 5\), the rows of the replay buffer, got 5"):
         inspection.plan(State(0, 5, replay=True))
     inspection.close()
@@ -122,6 +124,15 @@ def test_a_plan_can_be_given_up_and_another_one_gives_it_up(inspection):
     with pytest.raises(Cancelled):
         job.future.result()
     assert inspection.traces[following.future.result()].manifest["state"]["step"] == 1
+
+
+def test_a_trace_that_others_are_drawn_like_is_kept(inspection):
+    job = inspection.start(State(0, 0), {})
+    assert job.wait(10)
+    held = job.future.result()
+    *_, last = (inspection.plan(State(0, 0), like=held, seed=seed) for seed in range(20))  # more than are kept
+    assert held in inspection.traces
+    assert np.array_equal(last["basis"], inspection.traces[held]["basis"])
 
 
 def test_an_episode_can_be_played_by_the_policy():

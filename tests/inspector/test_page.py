@@ -21,8 +21,9 @@ pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import get_task  # noqa: E402
 from torchrl_etdmpc.inspector import load_trace, play_episode, trace_plan, with_settings  # noqa: E402
-from torchrl_etdmpc.inspector.inspection import Inspection, State  # noqa: E402
+from torchrl_etdmpc.inspector.inspection import Inspection, State, Strip  # noqa: E402
 from torchrl_etdmpc.inspector.page import make_page, page_settings, serve, slider_range  # noqa: E402
+from torchrl_etdmpc.inspector.saved_page import write_page  # noqa: E402
 from torchrl_etdmpc.inspector.settings import settings_of_class  # noqa: E402
 from torchrl_etdmpc.modules import WorldModel  # noqa: E402
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv  # noqa: E402
@@ -165,6 +166,29 @@ class Page:
         found = self.driver.execute_script(script, name)
         return [trace for trace in found if kind is None or trace["name"] == kind]
 
+    def rings(self, graph: str) -> list[dict[str, Any]]:
+        """Shapes around a clicked candidate, as they are drawn."""
+        script = """
+            const graph = document.getElementById(arguments[0]);
+            const drawn = graph.classList.contains('js-plotly-plot') ? graph : graph.querySelector('.js-plotly-plot');
+            const paths = drawn.querySelectorAll('.shapelayer path').length;
+            return (drawn._fullLayout.shapes || []).map(shape => ({xref: shape.xref, x: shape.xanchor,
+                y: shape.yanchor, paths: paths}));
+        """
+        return self.driver.execute_script(script, graph)
+
+    def count_drawn(self, graph: str) -> None:
+        """Counts in ``window.drawn`` how often a figure is drawn as a whole from now on."""
+        script = """
+            const react = Plotly.react;
+            window.drawn = 0;
+            Plotly.react = (graph, ...rest) => {
+                window.drawn += graph.parentElement.id === arguments[0] ? 1 : 0;
+                return react(graph, ...rest);
+            };
+        """
+        self.driver.execute_script(script, graph)
+
     def text(self, name: str) -> str:
         return self.driver.find_element("id", name).text
 
@@ -187,7 +211,7 @@ class Page:
             ActionChains(self.driver).move_to_element(point).pause(0.3).click().perform()
             end = time.monotonic() + 5
             while time.monotonic() < end:
-                rings = self.traces(graph, "clicked")
+                rings = self.rings(graph)
                 if rings:
                     return rings
         pytest.fail("no click reached a candidate")
@@ -246,7 +270,8 @@ def shows(page: Page, trace: Any, side: str, iteration: int) -> bool:
 
 def candidate_at(page: Page, rings: list[dict[str, Any]]) -> int:
     """The candidate in the middle of a ring in the first head's panel."""
-    middle = np.array([rings[0]["x"][0], rings[0]["y"][0]])
+    assert [ring["xref"] for ring in rings] == ["x", "x2"] and rings[0]["paths"] == 2
+    middle = np.array([rings[0]["x"], rings[0]["y"]])
     for kind in ("candidate", "elite", "proposal"):
         marks = page.traces("latent_plane-a", kind)[0]
         away = np.abs(np.stack([marks["x"], marks["y"]], 1) - middle).max(1)
@@ -262,10 +287,12 @@ def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
     from selenium.webdriver.common.keys import Keys
 
     page.driver.get(served.address)
+    # Both this thread and the page's play the episode with torch's one generator: one after the other.
+    wait_for(lambda: page.driver.find_elements("css selector", "#described-a li"), "the first state")
+    assert "episode 0, step 0" in page.text("described-a")
     first = expected(0)
     assert np.ptp(first["scores"][-1]) > 1e-2  # or any numbers would do
     wait_for(lambda: shows(page, first, "a", -1), "the plan of the first state")
-    assert "episode 0, step 0" in page.text("described-a")
     assert f"{float(first['value']):.3f}" in page.text("described-a")
 
     frames = wait_for(lambda: page.driver.find_elements("css selector", "#strip button"), "the filmstrip")
@@ -282,12 +309,16 @@ def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
     means = chosen["mean"][1, :, 0]
     wait_for_numbers(lambda: page.traces("plan_gaussian-a", "a1")[0]["y"], means, "the mean of that iteration")
 
+    page.count_drawn("latent_plane-a")
     clicked = page.click_candidate("latent_plane-a")
     candidate = candidate_at(page, clicked)
     table = chosen["returns"][1, candidate].reshape(3, -1)
     wait_for_numbers(lambda: page.traces("return_table-a")[0]["z"], table, "its return table")
+    assert page.driver.execute_script("return window.drawn") == 0  # the ring is moved, the candidates stay
     page.click("unclick")
-    wait_for(lambda: not page.traces("latent_plane-a", "clicked"), "the chosen sequence again")
+    wait_for(lambda: not page.rings("latent_plane-a"), "the chosen sequence again")
+    table = chosen["chosen_returns"].reshape(3, -1)
+    wait_for_numbers(lambda: page.traces("return_table-a")[0]["z"], table, "its return table again")
 
     page.push("iteration", Keys.END)
     wait_for(lambda: shows(page, chosen, "a", -1), "the last iteration again")
@@ -341,6 +372,25 @@ def test_the_theme_is_the_system_s_until_it_is_toggled(page, served):
         assert paper() == colour
         page.click("theme")
         assert paper() == other
+
+
+@pytest.mark.slow
+def test_nothing_is_cut_off_on_paper(page, tmp_path):
+    trace, frame = expected(0), np.zeros((64, 64, 3), np.uint8)
+    saved = write_page(tmp_path / "page", trace, trace, strip=Strip(list(range(30)), [frame] * 30), step=0)
+    page.driver.get(saved.as_uri())
+    wait_for(lambda: shows(page, trace, "b", -1), "the saved plan")
+    page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    paper = {"width": 700, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", paper)
+    script = """return Array.from(document.querySelectorAll('.js-plotly-plot'), graph =>
+        [Number(graph.querySelector('.main-svg').getAttribute('width')), graph.clientWidth])"""
+    wait_for(lambda: np.ptp(page.driver.execute_script(script), axis=1).max() <= 1, "figures of the paper's width")
+    assert page.driver.execute_script("return document.documentElement.scrollWidth") <= 700
+    strips = "return Array.from(document.querySelectorAll('.strip'), strip => strip.scrollWidth - strip.clientWidth)"
+    assert max(page.driver.execute_script(strips)) <= 0
+    assert not page.driver.find_element("id", "iteration").is_displayed()
+    assert "3 of 3" in page.text("iteration-value")
 
 
 def test_a_state_to_begin_with_is_planned_first(inspection):

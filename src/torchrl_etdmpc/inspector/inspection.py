@@ -25,6 +25,11 @@ __all__ = ["Inspection", "Job", "State", "Strip"]
 FRAME_SIZE = 160
 STRIP_FRAMES = 12
 _KEPT = 16  # traces, and episodes
+# What an observation leaves open (velocities that it lacks, contacts, the simulator's warm start) is not made up.
+_NO_SIMULATOR = (
+    "There are no frames, and the plan is not rolled in the simulator: a row of the replay buffer holds what was "
+    "observed, not the simulator's state; choose a state of an episode for both."
+)
 
 
 class State(NamedTuple):
@@ -185,17 +190,21 @@ class Inspection:
             raise Cancelled("cancelled; the plan before is still shown.")
         observation, plan_mean, place, about = self._state(job, state)
         job.begin("planning")
+        held = None
+        if like is not None and like in self.traces:
+            held = self.traces[like]
+            self.traces.move_to_end(like)  # it is still looked at
         trace = trace_plan(
             planner,
             observation,
             plan_mean=plan_mean,
             seed=seed,
-            like=None if like is None else self.traces.get(like),
+            like=held,
             progress=job.tell,
             **self.about,
             **about,
         )
-        notes = []
+        notes = [_NO_SIMULATOR] if state.replay else []
         if place is not None:
             job.begin("rolling the plan in the simulator")
             trace, notes = self._simulated(trace, planner, place)

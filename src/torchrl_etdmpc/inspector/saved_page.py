@@ -21,7 +21,8 @@ __all__ = ["facts_of", "frames_of", "setting_rows", "write_page"]
 
 MOVING = ("latent_plane", "return_table", "disagreement", "plan_gaussian")  # with the iteration
 WIDE = ("latent_plane",)
-_HERE = Path(__file__).parent
+ASSETS = Path(__file__).parent / "assets"
+_SCRIPT = Path(__file__).parent / "saved" / "saved_page.js"
 _POLICY = "default-src 'none'; script-src 'self' file:; style-src 'self' file: 'unsafe-inline'; img-src data:"
 
 
@@ -59,14 +60,10 @@ def write_page(
         "sides": [_side(side) for side in sides],
     }
     if other is not None:
-        content["difference"] = _plain(figures.compare_plans(trace, other))
+        content["difference"] = _plain(figures.plain(figures.compare_plans)(trace, other))
     write_whole(folder / "plotly.min.js", script)
     write_whole(folder / "data.js", f"window.INSPECTION = {json.dumps(content)};\n")
-    for source in (
-        _HERE / "assets" / "inspector.css",
-        _HERE / "assets" / "inspector.js",
-        _HERE / "saved" / "saved_page.js",
-    ):
+    for source in (ASSETS / "inspector.css", ASSETS / "inspector.js", _SCRIPT):
         write_whole(folder / source.name, source.read_text(encoding="utf-8"))
     trace.save(folder / "trace.npz")
     if other is None:
@@ -157,21 +154,24 @@ def _numbers(values: np.ndarray) -> str:
     return shown + (", ..." if len(values) > 6 else "")
 
 
-def _plain(figure: Any) -> Any:
-    return json.loads(figure.to_json())
+def _plain(drawing: figures.Drawing) -> Any:
+    """A drawing without arrays and numbers that JSON does not have."""
+    from plotly.io.json import to_json_plotly
+
+    return json.loads(str(to_json_plotly(drawing)))
 
 
 def _side(trace: Trace) -> dict[str, Any]:
     """Everything that the script draws of one trace."""
     made: dict[str, Any] = {}
     for name in figures.FIGURES:
-        function = getattr(figures, name)
+        draw = figures.plain(getattr(figures, name))
         if name == "return_table":
-            made[name] = _plain(function(trace))
+            made[name] = _plain(draw(trace))
         elif name in MOVING:
-            made[name] = [_plain(function(trace, iteration)) for iteration in range(trace.iterations)]
+            made[name] = [_plain(draw(trace, iteration)) for iteration in range(trace.iterations)]
         else:
-            made[name] = _plain(function(trace))
+            made[name] = _plain(draw(trace))
     side: dict[str, Any] = {"figures": made}
     scores = trace["scores"]
     side["scores"] = [[float(score) if np.isfinite(score) else None for score in row] for row in scores]

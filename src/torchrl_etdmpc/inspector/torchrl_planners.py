@@ -11,7 +11,8 @@ from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.modules import CEMPlanner, MPPIPlanner
 
-from torchrl_etdmpc.inspector.trace import FORMAT, KIND, Trace, as_array, latent_views, versions
+from torchrl_etdmpc.inspector.trace.latents import latent_views
+from torchrl_etdmpc.inspector.trace.trace import FORMAT, KIND, Trace, as_array, versions
 
 __all__ = ["trace_torchrl_planner"]
 

@@ -2,7 +2,7 @@
 (function () {
   "use strict";
   var state = { iteration: INSPECTION.iterations - 1, candidate: null, side: 0 };
-  var config = { displayModeBar: false, responsive: true };
+  var config = { displayModeBar: false };
 
   function numbers(packed) { // base64 of little-endian float32
     var text = atob(packed), bytes = new Uint8Array(text.length);
@@ -22,9 +22,8 @@
     var figure = copy(figureOf(side, name));
     var clicked = state.candidate !== null && state.side === side;
     if (name === "return_table" && clicked) { fill(figure, side); }
-    return Plotly.react(div, figure.data, figure.layout, config).then(function () {
-      if (name === "latent_plane" && clicked) { return ring(div); }
-      return div;
+    Plotly.react(div, figure.data, figure.layout, config).then(function () {
+      if (name === "latent_plane" && clicked) { moveRing(div, state.candidate); }
     });
   }
 
@@ -44,19 +43,9 @@
     figure.layout.title = { text: "candidate " + state.candidate + ", score " + (score === null ? "not finite" : score.toFixed(3)), font: { size: 13 } };
   }
 
-  function ring(div) {
-    var rings = [];
-    div._fullData.forEach(function (trace) {
-      var place = trace.customdata ? Array.from(trace.customdata).indexOf(state.candidate) : -1;
-      if (place >= 0) {
-        rings.push({
-          x: [trace.x[place]], y: [trace.y[place]], xaxis: trace.xaxis, yaxis: trace.yaxis, mode: "markers",
-          hoverinfo: "skip", showlegend: rings.length === 0, name: "clicked",
-          marker: { symbol: "circle-open", size: 18, color: "#CC79A7", line: { width: 3 } }
-        });
-      }
-    });
-    return Plotly.addTraces(div, rings);
+  function choose(side, candidate) {
+    moveRing(document.getElementById("latent_plane-" + "ab"[side]), candidate);
+    draw(side, "return_table");
   }
 
   function drawAll(names) {
@@ -80,10 +69,11 @@
     div.on("plotly_click", function (event) {
       var candidate = event.points[0].customdata;
       if (candidate === undefined) { return; }
+      var before = state.side;
       state.candidate = candidate;
       state.side = side;
-      draw(side, "latent_plane");
-      draw(side, "return_table");
+      if (before !== side) { choose(before, null); }
+      choose(side, candidate);
     });
   });
 })();

@@ -1,0 +1,9 @@
+"""The page in a browser: a dash app on an inspection, for this machine alone unless told otherwise."""
+
+from __future__ import annotations
+
+from torchrl_etdmpc.inspector.page.app import make_page
+from torchrl_etdmpc.inspector.page.controls import page_settings, slider_range
+from torchrl_etdmpc.inspector.page.server import serve
+
+__all__ = ["make_page", "page_settings", "serve", "slider_range"]
