@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.modules import CEMPlanner, MPPIPlanner
 
 from torchrl_etdmpc.inspector.trace.latents import latent_views
-from torchrl_etdmpc.inspector.trace.trace import FORMAT, KIND, Trace, as_array, versions
+from torchrl_etdmpc.inspector.trace.trace import Trace, trace_of
 
 __all__ = ["trace_torchrl_planner"]
 
@@ -97,19 +97,8 @@ def trace_torchrl_planner(
         start = torch.cat([state.get(key).flatten() for key in seen])
         rolled = [_observations(rolled, seen) for _, rolled in recorder.seen]
         tensors |= {"latent": start} | latent_views(rolled, start)[1]
-    manifest = {
-        "kind": KIND,
-        "format": FORMAT,
-        "planner": type(planner).__name__,
-        "settings": _settings(planner),
-        "seed": seed,
-        "explore": False,
-        "fallback": False,
-        "state": {},
-        "versions": dict(versions()),
-        "seconds": round(time.perf_counter() - started, 4),
-    }
-    return Trace(manifest | about, {name: as_array(tensor) for name, tensor in tensors.items()})
+    told = {"seed": seed, "explore": False, "fallback": False} | about
+    return trace_of(planner, _settings(planner), tensors, started=started, **told)
 
 
 class _Recorder:

@@ -183,7 +183,8 @@ class LatentRolloutLoss(LossModule):
             terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head;
                 without one it is looked at only to refuse termination.
             plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
-            plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``.
+            plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``; zeros for a step that has
+                no plan, and then trains everything but the policy.
             priority_weight (NestedKey): importance weight of each slice, ``[B, T]``, which a prioritised sampler
                 writes; optional.
             priority (NestedKey): where the new priorities are written, ``[B, T]``, if the batch has weights.

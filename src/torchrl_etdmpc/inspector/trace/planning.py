@@ -20,7 +20,7 @@ from torchrl_etdmpc.functional import (
 from torchrl_etdmpc.inspector.settings import plain_settings
 from torchrl_etdmpc.inspector.trace.latents import candidate_latents, rolled_out
 from torchrl_etdmpc.inspector.trace.progress import watched
-from torchrl_etdmpc.inspector.trace.trace import FORMAT, KIND, Trace, as_array, versions
+from torchrl_etdmpc.inspector.trace.trace import Trace, trace_of
 from torchrl_etdmpc.modules.prediction import PredictionModel, has_policy
 from torchrl_etdmpc.planners import AdaptiveScore, EnsembleMPPIPlanner, Plan, PlanNoise, PlanTrace
 from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
@@ -113,19 +113,8 @@ def trace_plan(
         tensors["chosen_returns"] = search.returns[-1, chosen]
     components, seen = candidate_latents(model, latent, search.actions, like, progress)
     tensors |= seen | {"chosen_points": components.project(rolled_out(model, latent, chosen_actions[None])[:, :, 0])}
-    manifest = {
-        "kind": KIND,
-        "format": FORMAT,
-        "planner": type(planner).__name__,
-        "settings": plain_settings(planner),
-        "seed": seed,
-        "explore": explore,
-        "fallback": bool(plan.fallback[0]),
-        "state": {},
-        "versions": dict(versions()),
-        "seconds": round(time.perf_counter() - started, 4),
-    }
-    return Trace(manifest | about, {name: as_array(tensor) for name, tensor in tensors.items()})
+    told = {"seed": seed, "explore": explore, "fallback": bool(plan.fallback[0])} | about
+    return trace_of(planner, plain_settings(planner), tensors, started=started, **told)
 
 
 def _start(

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import io
 import json
+import time
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -248,6 +249,22 @@ def load_trace(path: str | Path) -> Trace:
 def checksum(path: str | Path) -> str:
     """sha256 of a file, for a manifest."""
     return hashlib.sha256(read_whole(Path(path).expanduser())).hexdigest()
+
+
+def trace_of(
+    planner: Any, settings: Mapping[str, Any], tensors: Mapping[str, Any], *, started: float, **about: Any
+) -> Trace:
+    """A new trace of a planner; ``started`` is when planning began, by ``time.perf_counter``."""
+    manifest = {
+        "kind": KIND,
+        "format": FORMAT,
+        "planner": type(planner).__name__,
+        "settings": settings,
+        "state": {},
+        "versions": dict(versions()),
+        "seconds": round(time.perf_counter() - started, 4),
+    }
+    return Trace(manifest | about, {name: as_array(tensor) for name, tensor in tensors.items()})
 
 
 def as_array(tensor: Tensor) -> np.ndarray:
