@@ -26,6 +26,13 @@ def test_a_meaning_comes_from_the_class_that_takes_the_argument_without_its_defa
     assert not any("`" in setting.meaning for setting in settings.values())
 
 
+def test_a_meaning_does_not_repeat_the_setting_s_name():
+    for config_class in (TrainConfig, EvaluateConfig):
+        settings = settings_of(config_class)
+        assert settings["task.action_repeat"].meaning.startswith("Environment steps per decision. Default: ")
+        assert settings["task.terminates"].meaning.startswith("Whether episodes can end before their time limit. ")
+
+
 def test_a_field_s_own_docstring_comes_first_and_a_group_inherits_those_of_its_base():
     settings = settings_of(TrainConfig)
     assert settings["planner.iterations"].meaning == settings["reanalyze.iterations"].meaning

@@ -48,7 +48,7 @@ def test_without_a_measured_speed_the_time_left_is_not_known(small, tmp_path):
     runs = small.experiment().runs(tmp_path)
     text = status_text(runs, [Progress("waiting")])
     assert text.splitlines()[1].split() == ["plain", "cartpole-balance", "0/1", "0", "-", "-", "?"]
-    assert text.endswith("1 runs: 1 waiting; about ? left with 1 at a time")
+    assert text.endswith("1 runs: 1 waiting; the time left is known when a run has written a row")
 
 
 def test_when_all_is_done_nothing_is_left(small, tmp_path):

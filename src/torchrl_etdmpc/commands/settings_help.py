@@ -76,7 +76,10 @@ def settings_of(config_class: type, prefix: str = "") -> dict[str, Setting]:
             found |= settings_of(typing.cast(type, hint), f"{field.name}.")
             continue
         name = f"task.{field.name}" if not prefix and field.name in _TASK_SETTINGS else f"{prefix}{field.name}"
-        found[name] = Setting(name, hint, field.default, meanings.get(field.name, ""))
+        meaning = meanings.get(field.name, "")
+        for own_name in (f" ({name} on the command line)", f" ({name})"):
+            meaning = meaning.replace(own_name, "")  # a docstring says it, where the name stands before it here
+        found[name] = Setting(name, hint, field.default, meaning)
     return found
 
 

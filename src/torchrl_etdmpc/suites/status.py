@@ -59,7 +59,9 @@ def status_text(runs: Sequence[Run], progress: Sequence[Progress], workers: int 
     said = ", ".join(f"{states.count(state)} {state}" for state in get_args(State) if state in states)
     at_a_time = states.count("running") or workers
     total = f"{len(runs)} runs: {said}"
-    if left_s:
+    if math.isnan(left_s):
+        total += "; the time left is known when a run has written a row"
+    elif left_s:
         total += f"; about {duration(left_s / at_a_time)} left with {at_a_time} at a time"
     failures = [
         f"failed: {run.name}: {entry.error}"
