@@ -26,8 +26,12 @@ ROWS = pytest.StashKey[list]()
 def pytest_configure(config: pytest.Config) -> None:
     sys.path.insert(0, str(Path(__file__).parent))
     config.stash[ROWS] = []
-    torch.set_num_threads(1)
     torch.set_float32_matmul_precision("high")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> None:
+    torch.set_num_threads(1)  # every time: closing a batched environment of TorchRL changes it
 
 
 def processor() -> str:

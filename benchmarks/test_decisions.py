@@ -24,6 +24,11 @@ def named(num_envs: int) -> str:
     return "one environment" if num_envs == 1 else f"{num_envs} environments"
 
 
+def rounds_of(num_envs: int) -> int:
+    """A round of many environments is long: at least 200 decisions are timed, in at least 5 rounds."""
+    return max(20 // num_envs, 5)
+
+
 def begin(config: TrainConfig, folder) -> TrainingRun:
     """A run that has compiled, and has finished its random phase and pretraining."""
     parallel = DEVICE.type == "cuda"
@@ -73,7 +78,7 @@ def test_decision(measure, tmp_path, name, num_envs, variant):
             f"decision, {name}, {named(num_envs)}",
             variant,
             decide,
-            rounds=1 if large else 20,
+            rounds=1 if large else rounds_of(num_envs),
             warmup_rounds=0 if large else 2,
             calls=steps * num_envs,
         )
@@ -105,7 +110,7 @@ def test_decision_where_episodes_end_early(measure, tmp_path, num_envs, variant)
             f"decision, cpu, episodic, {named(num_envs)}",
             variant,
             decide,
-            rounds=20,
+            rounds=rounds_of(num_envs),
             warmup_rounds=2,
             calls=steps * num_envs,
         )
