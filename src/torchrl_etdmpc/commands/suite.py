@@ -282,7 +282,7 @@ def _list() -> str:
 
 def _plan(experiment: Experiment, runs: list[Run]) -> str:
     steps = sum(run.config.total_env_steps for run in runs)
-    lines = [shlex.join(command(run)[1:]) for run in runs]
+    lines = [shlex.join(["python", *command(run)[1:]]) for run in runs]
     each = len(experiment.tasks) * len(experiment.seeds)
     searches = [
         f"{name}: a search of {search.trials} trials, {each} runs each" for name, search in experiment.searches.items()

@@ -33,9 +33,10 @@ def command(run: Run, **more: Any) -> list[str]:
     """
     config = run.config
     usual = flat(preset(config.preset).to_dict())
-    values = {name: value for name, value in flat(config.to_dict()).items() if value != usual[name]}
-    values |= {"preset": config.preset, "task": run.task, "seed": run.seed, "total_env_steps": config.total_env_steps}
-    values |= {"run_dir": str(run.path), "resume": "auto"} | more
+    first = {"task": run.task, "preset": config.preset, "seed": run.seed, "total_env_steps": config.total_env_steps}
+    differing = {name: value for name, value in flat(config.to_dict()).items() if value != usual[name]}
+    # Twice: to stand first, and to have the last word (a task is named as the experiment names it).
+    values = first | differing | first | {"run_dir": str(run.path), "resume": "auto"} | more
     typed = {f"task.{name}" if name in TASK_SETTINGS else name: value for name, value in values.items()}
     settings = [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in typed.items()]
     return [sys.executable, "-m", "torchrl_etdmpc.commands", "train", *settings]
