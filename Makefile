@@ -64,6 +64,7 @@ lint: $(READY)
 	@$(VENV)/bin/ruff check
 	@$(VENV)/bin/ruff format --check
 	@$(VENV)/bin/pyright
+	@$(VENV)/bin/pyright -p benchmarks
 
 bench: $(READY)
 	@if [ -d benchmarks ]; then $(VENV)/bin/python -m pytest benchmarks --benchmark-only $(ARGS); \

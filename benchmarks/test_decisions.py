@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import pytest
 import torch
@@ -128,7 +129,7 @@ def test_one_step_of_walker(measure, variant):
     """
     config = configure("cpu", "eager", task=TASK, num_envs=1, eval_episodes=1, total_env_steps=100_000)
     env = make_env(TASK, seed=0)
-    raw = env._env
+    raw: Any = env._env
     raw.reset()
     actions = itertools.cycle(torch.rand(500, 6) * 2 - 1)  # what the random policy would do: a still walker costs less
 
