@@ -147,8 +147,8 @@ def report(ours: list[Path]) -> str:
     curves = curves[curves["task"].isin(TASKS)]
     methods = [*sorted(set(curves["method"]) - {"cpu"}), "cpu"]
     styles = method_styles(methods)
-    curves["minutes"] = curves["wall_time_s"] / 60
-    minutes = curves.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
+    timed = curves.assign(minutes=curves["wall_time_s"] / 60)
+    minutes = timed.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
     found = estimate(curves).join(minutes, on=["task", "method", "env_steps"])
     tasks = [task for task in TASKS if task in set(found["task"])]
     figure = Figure(figsize=(3.1 * len(tasks), 5.2), layout="constrained")
