@@ -58,6 +58,16 @@ def test_every_public_name_has_an_example(generate):
     assert missing == set()
 
 
+def test_the_names_of_torchrl_that_have_a_page_exist_in_it():
+    entries = (DOCS / "inventories" / "torchrl.txt").read_text(encoding="utf-8").splitlines()[3:]
+    assert entries
+    for entry in entries:
+        name, kind, page = entry.split()
+        module, _, attribute = name.rpartition(".")
+        assert inspect.isclass(getattr(importlib.import_module(module), attribute)) == (kind == "class"), name
+        assert page.endswith(f"/{name}.html")
+
+
 def test_the_equations_name_functions_and_tests_that_exist(generate):
     for equation in generate.EQUATIONS:
         module, _, name = equation.function.rpartition(".")

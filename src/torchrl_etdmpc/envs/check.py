@@ -28,7 +28,7 @@ def check_env(env: EnvBase, model: Any = None) -> None:
     ======================================= ==============================================================
 
     It looks at the environment's specs and takes no step; whether the values agree with the specs is what
-    :func:`torchrl.envs.utils.check_env_specs` tests.
+    :func:`torchrl.envs.check_env_specs` tests.
 
     Args:
         env (EnvBase): any TorchRL environment, batched or not, with any transforms around it.

@@ -39,7 +39,7 @@ def import_task(
             has to, so here it can only be told what is true.
         episode_length (int, optional): the time limit in env steps; a function's environment without one, or with a
             longer one, is truncated there. Needed where the environment does not show a limit (a
-            :class:`~torchrl.envs.StepCounter`, or a Gymnasium environment's own).
+            :class:`~torchrl.envs.transforms.StepCounter`, or a Gymnasium environment's own).
         terminates (bool, optional): whether an episode can end for another reason than the time limit; ``True`` for a
             function unless told.
 

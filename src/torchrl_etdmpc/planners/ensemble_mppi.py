@@ -63,7 +63,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     dynamics heads and value heads (thesis Eq. 3.1) is reduced to a score by ``score``. The planner acts on a real
     environment (it reads ``observation``) as well as on the :class:`LatentEnv` it holds (it reads ``latent``).
 
-    It obeys :func:`torchrl.envs.utils.exploration_type`: with ``RANDOM`` (a collector's default) the action is a sample
+    It obeys :func:`torchrl.envs.exploration_type`: with ``RANDOM`` (a collector's default) the action is a sample
     and the target's mean comes from ``first_action``; otherwise the action is the mean from ``eval_first_action``.
 
     The warm start travels in the tensordict: append :meth:`make_tensordict_primer` to the environment, which zeroes it
