@@ -177,8 +177,21 @@ def test_a_public_name_without_a_docstring_is_noticed(generate, monkeypatch):
         ("docs/generate.py", "ROOMS = (", 'ROOMS = (\n    "gone",', "torchrl_etdmpc.gone"),
         ("src/torchrl_etdmpc/functional/simnorm.py", '"""Softmax (temp', 'f"""Softmax (temp', "simnorm is public"),
         ("src/torchrl_etdmpc/training/config.py", "    reward_coef:", "    reward_weight:", "names loss.reward_coef"),
+        (
+            "src/torchrl_etdmpc/envs/check.py",
+            "torchrl.envs.check_env_specs`",
+            "torchrl.envs.gone`",
+            "torchrl.envs.gone",
+        ),
     ],
-    ids=["a broken tutorial", "a dead link", "a room that is gone", "a missing docstring", "a renamed setting"],
+    ids=[
+        "a broken tutorial",
+        "a dead link",
+        "a room that is gone",
+        "a missing docstring",
+        "a renamed setting",
+        "a name that is not in TorchRL's reference",
+    ],
 )
 def test_the_build_stops_at(file, old, new, said, tmp_path):
     pytest.importorskip("sphinx_gallery")
