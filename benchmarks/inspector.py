@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    answer: dict[str, Any] = {"task": TASK, "repeats": options.repeats, "cores": os.cpu_count(), "sizes": {}}
+    answer: dict[str, Any] = {"task": TASK, "cores": os.cpu_count(), "sizes": {}}
     answer["versions"] = library_versions() | {name: version(name) for name in ("dash", "plotly", "selenium")}
     answer |= {"load_average_before": os.getloadavg(), "share_of_a_core": [share_of_a_core()]}
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -118,6 +118,7 @@ def measured(name: str, repeats: int) -> dict[str, Any]:
     finally:
         inspection.close()
     return {
+        "repeats": repeats,
         "candidates": trace["scores"].shape[1],
         "iterations": trace.iterations,
         "horizon": trace.horizon,

@@ -70,11 +70,9 @@ def test_evaluating_candidates(measure, name, variant):
     def evaluate(latent, actions):
         return imagined_returns(agent.world_model, latent, actions, **options)
 
-    call = (
-        evaluate
-        if variant == "eager"
-        else compile_call(evaluate, resolve_compile(SETTINGS[variant], DEVICE, decisions=1_000_000))
-    )
+    call = evaluate
+    if variant != "eager":
+        call = compile_call(evaluate, resolve_compile(SETTINGS[variant], DEVICE, decisions=1_000_000))
     with torch.no_grad():
         latent = agent.world_model.encode(torch.randn(1, OBSERVATION_DIM, device=DEVICE))
         actions = torch.rand(1, samples, planner.horizon, ACTION_DIM, device=DEVICE) * 2 - 1

@@ -34,12 +34,12 @@ def command(run: Run, **more: Any) -> list[str]:
     config = run.config
     usual = flat(preset(config.preset).to_dict())
     first = {"task": run.task, "preset": config.preset, "seed": run.seed, "total_env_steps": config.total_env_steps}
-    differing = {name: value for name, value in flat(config.to_dict()).items() if value != usual[name]}
-    # Twice: to stand first, and to have the last word (a task is named as the experiment names it).
-    values = first | differing | first | {"run_dir": str(run.path), "resume": "auto"} | more
+    settings = {name: value for name, value in flat(config.to_dict()).items() if name not in first}
+    differing = {name: value for name, value in settings.items() if value != usual[name]}
+    values = first | differing | {"run_dir": str(run.path), "resume": "auto"} | more
     typed = {f"task.{name}" if name in TASK_SETTINGS else name: value for name, value in values.items()}
-    settings = [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in typed.items()]
-    return [sys.executable, "-m", "torchrl_etdmpc.commands", "train", *settings]
+    words = [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in typed.items()]
+    return [sys.executable, "-m", "torchrl_etdmpc.commands", "train", *words]
 
 
 def log_file(run: Run) -> Path:
