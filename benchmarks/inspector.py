@@ -2,11 +2,12 @@
 
     python benchmarks/inspector.py [--sizes NAME ...] [--repeats 5]
 
-Drives the real page as a reader does, by keys and clicks, on walker-walk, with networks of the preset's size that were
-not trained (what is drawn costs the same). An interaction lasts from its event to the last change of the page,
-painted. On a busy machine that says as much about the others as about the page, so beside the median seconds stand the
-CPU seconds of the page's main thread and of this process, which serves it, the load, and how much of a core a busy
-loop of this process got. Needs Chromium and chromedriver; frames are rendered where MUJOCO_GL, or EGL, can.
+Drives the real page as a reader does, by keys and clicks, on walker-walk, served with all cores as the command does,
+with networks of the preset's size that were not trained (what is drawn costs the same). An interaction lasts from its
+event to the last change of the page, painted. On a busy machine that says as much about the others as about the page,
+so beside the median seconds stand the CPU seconds of the page's main thread and of this process, which serves it, the
+load, and how much of a core a busy loop of this process got. Needs Chromium and chromedriver; frames are rendered where
+MUJOCO_GL, or EGL, can.
 Writes `benchmarks/results/cpu/inspector.json`.
 """
 
@@ -72,8 +73,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    answer: dict[str, Any] = {"task": TASK, "cores": os.cpu_count(), "sizes": {}}
+    answer: dict[str, Any] = {"task": TASK, "cores": os.cpu_count(), "threads": torch.get_num_threads(), "sizes": {}}
     answer["versions"] = library_versions() | {name: version(name) for name in ("dash", "plotly", "selenium")}
     answer |= {"load_average_before": os.getloadavg(), "share_of_a_core": [share_of_a_core()]}
     options.out.parent.mkdir(parents=True, exist_ok=True)

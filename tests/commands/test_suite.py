@@ -97,6 +97,14 @@ def test_the_help_names_every_setting(call):
         assert f"  {name}" in out
 
 
+@pytest.mark.parametrize(("asked", "seeds"), [("3", [1, 2, 3]), ("[3]", [3]), ("7,5", [7, 5]), ("[7,5]", [7, 5])])
+def test_seeds_are_how_many_or_which(call, mine, asked, seeds):
+    message, out = call(f"experiment={mine()}", "dry_run=true", f"seeds={asked}", "variants=a")
+    assert message is None
+    planned = [line for line in out.splitlines() if line.startswith("python ")]
+    assert [int(word.removeprefix("seed=")) for line in planned for word in line.split() if "seed=" in word] == seeds
+
+
 def test_a_dry_run_says_what_would_be_run_and_changes_nothing(call, mine, tmp_path):
     message, out = call(f"experiment={mine()}", "dry_run=true", "runs_dir=here")
     assert message is None

@@ -64,7 +64,7 @@ class SuiteConfig:
     tasks: str | None = None
     """Tasks or sets of tasks, with commas between, instead of the experiment's."""
     seeds: str | None = None
-    """How many, or seeds with commas between, instead of the experiment's."""
+    """How many, or which ("7,8", and "[7]" where it is one), instead of the experiment's."""
     variants: str | None = None
     """Some of the experiment's variants, with commas between. Default: all."""
     workers: int | None = None
@@ -253,8 +253,8 @@ def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
     if config.tasks:
         changes["tasks"] = config.tasks.split(",")
     if config.seeds:
-        seeds = [_value(seed) for seed in config.seeds.split(",")]
-        changes["seeds"] = seeds[0] if len(seeds) == 1 else seeds
+        seeds = [_value(seed) for seed in config.seeds.strip("[]").split(",")]
+        changes["seeds"] = seeds if "," in config.seeds or config.seeds.startswith("[") else seeds[0]
     experiment = read_experiment(find_experiment(config.experiment, EXPERIMENTS), **changes)
     if not config.variants:
         return experiment

@@ -9,7 +9,7 @@ from torchrl_etdmpc.inspector.inspection import State as Chosen
 from torchrl_etdmpc.inspector.page.controls import changed_settings, shown, text_of
 from torchrl_etdmpc.inspector.settings import plain_settings
 
-_PATIENCE = 0.4  # seconds after which a plan shows its progress
+_PATIENCE = 0.8  # seconds after which a plan shows its progress: what is quicker comes without asking again
 
 
 def connect_plans(app: Any, inspection: Inspection) -> None:

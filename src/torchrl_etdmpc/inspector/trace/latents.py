@@ -62,7 +62,7 @@ def latent_views(
     else:
         components = Components(*(torch.from_numpy(like[name]).to(start) for name in ("centre", "basis")))
     points = torch.stack([components.project(latents).permute(2, 0, 1, 3) for latents in rolled])
-    spread = torch.stack([latents.std(1, correction=0).square().sum(-1).sqrt().mT for latents in rolled])
+    spread = torch.stack([_spread(latents).mT for latents in rolled])
     total = sum((latents - components.centre).square().sum() for latents in rolled)
     return components, {
         **components._asdict(),
@@ -71,6 +71,15 @@ def latent_views(
         "points": points,
         "latent_spread": spread,
     }
+
+
+def _spread(latents: Tensor) -> Tensor:
+    """Root mean square distance ``[H, N]`` of the heads' latents ``[H, F, N, L]`` from their mean.
+
+    By hand: on a CPU, ``Tensor.std`` over a dimension that is not the last takes longer than all of the planning.
+    """
+    apart = latents - latents.mean(1, keepdim=True)
+    return apart.square().sum(-1).mean(1).sqrt()
 
 
 def candidate_latents(
