@@ -1,4 +1,4 @@
-"""Example scripts as processes of their own, without the seconds that every one of them would spend on imports."""
+"""Example scripts: in this process, or as processes of their own without the seconds that imports would take each."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import os
 import runpy
 import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from multiprocessing.forkserver import _forkserver  # the one of this process
 from pathlib import Path
 
 import pytest
+import torch
+
+from torchrl_etdmpc.training import TrainConfig, build_agent, save_agent
 
 collect_ignore = ["script.py"]  # no test, and nothing to import
 ROOT = Path(__file__).resolve().parents[2]
@@ -80,6 +84,56 @@ class Script:
         self._process.join()
         for file in self._files:
             file.unlink()
+
+
+@pytest.fixture
+def run_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> Iterator[Callable[..., tuple[str | None, str, str]]]:
+    """Runs ``examples/<script>`` with arguments in this process, in an empty folder: exit message, stdout and stderr.
+
+    What a script sets for its process is as it was afterwards.
+    """
+    precision, threads = torch.get_float32_matmul_precision(), torch.get_num_threads()
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+
+    def run(script: str, *arguments: str) -> tuple[str | None, str, str]:
+        path = str(ROOT / "examples" / script)
+        monkeypatch.setattr(sys, "argv", [path, *arguments])
+        message = None
+        try:
+            runpy.run_path(path, run_name="__main__")
+        except SystemExit as stop:
+            message = stop.code
+        return message, *capfd.readouterr()
+
+    yield run
+    torch.set_float32_matmul_precision(precision)
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def save_untrained() -> Callable[..., Path]:
+    """Saves an untrained agent of small networks, as if 400 env steps had been made."""
+
+    def save(folder: Path, observation_dim: int, **settings: object) -> Path:
+        config = TrainConfig.from_dict(
+            {
+                "compile": "off",
+                "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+                "planner": {"horizon": 2, "num_samples": 12, "num_elites": 4, "num_proposals": 2, "iterations": 2},
+                **settings,
+            }
+        )
+        torch.manual_seed(0)
+        agent = build_agent(config, observation_dim=observation_dim, action_dim=1)
+        return save_agent(folder / "last.pt", agent, config, {"env_steps": 400})
+
+    return save
 
 
 @pytest.fixture(scope="session", autouse=True)

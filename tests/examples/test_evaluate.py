@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import os
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,56 +17,21 @@ from torchrl_etdmpc.collectors import evaluate  # noqa: E402
 from torchrl_etdmpc.envs import make_env  # noqa: E402
 from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
-    TrainConfig,
-    build_agent,
     load_agent,
-    save_agent,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "evaluate.py"
 
 
-def save_untrained(folder: Path, observation_dim: int, **settings: object) -> Path:
-    """An untrained agent of small networks, as if 400 env steps had been made."""
-    config = TrainConfig.from_dict(
-        {
-            "compile": "off",
-            "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
-            "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
-            **settings,
-        }
-    )
-    torch.manual_seed(0)
-    agent = build_agent(config, observation_dim=observation_dim, action_dim=1)
-    return save_agent(folder / "last.pt", agent, config, {"env_steps": 400})
-
-
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checkpoint(tmp_path_factory: pytest.TempPathFactory, save_untrained) -> Path:
     return save_untrained(tmp_path_factory.mktemp("run"), 5, task="cartpole-balance")
 
 
 @pytest.fixture
-def run_main(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
-) -> Callable[..., tuple[str | None, str, str]]:
-    """Runs the script in this process, in an empty directory; returns its exit message, stdout and stderr."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
-    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
-    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> tuple[str | None, str, str]:
-        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
-        message = None
-        try:
-            runpy.run_path(str(SCRIPT), run_name="__main__")
-        except SystemExit as error:
-            message = error.code
-        return message, *capfd.readouterr()
-
-    return run
+def run_main(run_here) -> Callable[..., tuple[str | None, str, str]]:
+    return partial(run_here, "evaluate.py")
 
 
 def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -112,7 +77,7 @@ def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_m
     assert out.startswith("cartpole-swingup (bare, trained for 400 env steps): return ")
 
 
-def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, run_main):
+def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, run_main, save_untrained):
     pytest.importorskip("gymnasium")
     task = {"task": "gym/Pendulum-v1", "action_repeat": 2, "episode_length": 40}
     checkpoint = save_untrained(tmp_path, 3, **task)
@@ -127,7 +92,7 @@ def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, r
     assert out == line.replace("cartpole-balance", "gym/Pendulum-v1") + "\n"
 
 
-def test_the_command_may_change_the_protocol(tmp_path, run_main):
+def test_the_command_may_change_the_protocol(tmp_path, run_main, save_untrained):
     pytest.importorskip("gymnasium")
     checkpoint = save_untrained(tmp_path, 3, task="gym/Pendulum-v1", action_repeat=2, episode_length=40)
     common = (f"checkpoint={checkpoint}", "episodes=1", "policy=bare", "device=cpu", "task.action_repeat=4")
@@ -139,7 +104,7 @@ def test_the_command_may_change_the_protocol(tmp_path, run_main):
     assert returns[0] < returns[1] < 0  # two decisions from the same state cost more than the first alone
 
 
-def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main):
+def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, save_untrained):
     """Even if it terminates early and others follow."""
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")

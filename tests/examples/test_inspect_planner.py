@@ -2,15 +2,14 @@ from __future__ import annotations
 
 import builtins
 import os
-import runpy
 import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 pytest.importorskip("hydra")
 pytest.importorskip("gymnasium")
@@ -22,48 +21,22 @@ from torchrl_etdmpc import commands  # noqa: E402
 from torchrl_etdmpc.checkpoints import CheckpointStore  # noqa: E402
 from torchrl_etdmpc.inspector import load_trace  # noqa: E402
 from torchrl_etdmpc.testing import random_slices  # noqa: E402
-from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, save_agent  # noqa: E402
+from torchrl_etdmpc.training import load_agent  # noqa: E402
 
 SCRIPT = Path(__file__).resolve().parents[2] / "examples" / "inspect_planner.py"
 
 
-def save_untrained(folder: Path, observation_dim: int = 3, **settings: object) -> Path:
-    config = TrainConfig.from_dict(
-        {
-            "task": "gym/Pendulum-v1",
-            "compile": "off",
-            "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
-            "planner": {"horizon": 2, "num_samples": 12, "num_elites": 4, "num_proposals": 2, "iterations": 2},
-            **settings,
-        }
-    )
-    torch.manual_seed(0)
-    agent = build_agent(config, observation_dim=observation_dim, action_dim=1)
-    return save_agent(folder / "last.pt", agent, config, {"env_steps": 400})
+PENDULUM = "gym/Pendulum-v1"
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_untrained(tmp_path_factory.mktemp("run"))
+def checkpoint(tmp_path_factory: pytest.TempPathFactory, save_untrained) -> Path:
+    return save_untrained(tmp_path_factory.mktemp("run"), 3, task=PENDULUM)
 
 
 @pytest.fixture
-def run_main(tmp_path, monkeypatch, capfd) -> Callable[..., tuple[str | None, str, str]]:
-    """Runs the script in this process, in an empty directory; returns its exit message, stdout and stderr."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> tuple[str | None, str, str]:
-        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
-        message = None
-        try:
-            runpy.run_path(str(SCRIPT), run_name="__main__")
-        except SystemExit as error:
-            message = error.code
-        return message, *capfd.readouterr()
-
-    return run
+def run_main(run_here) -> Callable[..., tuple[str | None, str, str]]:
+    return partial(run_here, "inspect_planner.py")
 
 
 def test_a_page_is_saved_without_a_server(checkpoint, run_main, tmp_path):
@@ -89,8 +62,8 @@ def test_a_random_state_is_that_of_the_seed(checkpoint, run_main, tmp_path):
     assert one.manifest["state"]["seed"] == 5
 
 
-def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path):
-    checkpoint = save_untrained(tmp_path / "checkpoints")
+def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, save_untrained):
+    checkpoint = save_untrained(tmp_path / "checkpoints", 3, task=PENDULUM)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
     rows = random_slices(3, 1).flatten(0, 1)
     buffer.extend(rows)
@@ -137,11 +110,11 @@ def test_a_port_in_use_is_one_line(checkpoint, run_main):
     assert message.startswith(f"error: port={port} cannot be used (Address already in use); choose another one")
 
 
-def test_what_is_not_a_checkpoint_or_of_another_size_is_one_line(run_main, tmp_path):
+def test_what_is_not_a_checkpoint_or_of_another_size_is_one_line(run_main, tmp_path, save_untrained):
     (tmp_path / "notes.pt").write_text("hello")
     message, _, _ = run_main("checkpoint=notes.pt", "save=page")
     assert message.startswith("error: notes.pt is not a readable checkpoint")
-    larger = save_untrained(tmp_path / "larger", observation_dim=7)
+    larger = save_untrained(tmp_path / "larger", 7, task=PENDULUM)
     message, _, _ = run_main(f"checkpoint={larger}", "state=0:0", "steps=2", "save=page")
     assert "observation has 3 entries instead of the model's 7" in message
     assert not (tmp_path / "page").exists()
@@ -179,7 +152,7 @@ def test_a_renderer_is_looked_for(monkeypatch, before, library, after):
 
 
 @pytest.mark.slow
-def test_a_machine_without_a_renderer_gets_the_page_without_frames(tmp_path):
+def test_a_machine_without_a_renderer_gets_the_page_without_frames(tmp_path, save_untrained):
     """A process of its own: it begins anew when the renderer that it found cannot be imported."""
     checkpoint = save_untrained(tmp_path, 5, task="cartpole-balance")
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}

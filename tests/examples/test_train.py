@@ -6,13 +6,11 @@ import contextlib
 import csv
 import json
 import re
-import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import torch
 
 pytest.importorskip("gymnasium")
 pytest.importorskip("hydra")
@@ -66,32 +64,19 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture
 def run_main(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here
 ) -> Iterator[Callable[..., tuple[str | None, str]]]:
-    """Runs a script in this process, in a directory of its own; returns its exit message and what it printed."""
-    precision, threads = torch.get_float32_matmul_precision(), torch.get_num_threads()
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
-    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    """Runs a script beside a module of the user's; returns its exit message and what it printed."""
     (tmp_path / "mymodule.py").write_text(MODULE)
 
     def run(script: str, *arguments: str) -> tuple[str | None, str]:
         monkeypatch.setattr("torchrl_etdmpc.envs.tasks._tasks", dict(TASKS))  # as a new process would know them
         sys.modules.pop("mymodule", None)
         (tmp_path / "imported").unlink(missing_ok=True)
-        monkeypatch.setattr(sys, "argv", [script, *arguments])
-        message = None
-        try:
-            runpy.run_path(str(ROOT / "examples" / script), run_name="__main__")
-        except SystemExit as stop:
-            message = stop.code
-        return message, capfd.readouterr().out
+        return run_here(script, *arguments)[:2]
 
     yield run
     sys.modules.pop("mymodule", None)
-    torch.set_float32_matmul_precision(precision)
-    torch.set_num_threads(threads)
 
 
 def import_tasks() -> dict:

@@ -6,10 +6,8 @@ import importlib.util
 import json
 import os
 import re
-import runpy
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -52,30 +50,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory, run_script) -> tuple[Path
     """A small run, started in an empty directory like a user would."""
     directory = tmp_path_factory.mktemp("empty")
     return directory, run_script(SCRIPT, *SMALL_RUN, "run_dir=runs/first", cwd=directory)
-
-
-@pytest.fixture
-def run_main(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
-) -> Iterator[Callable[..., str]]:
-    """Runs the script in this process, in an empty directory; returns what it leaves on stderr when it fails."""
-    precision, threads = torch.get_float32_matmul_precision(), torch.get_num_threads()
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
-    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> str:
-        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
-        with pytest.raises(SystemExit) as caught:
-            runpy.run_path(str(SCRIPT), run_name="__main__")
-        out, err = capfd.readouterr()
-        assert out == ""
-        assert isinstance(caught.value.code, str)  # Python prints it on stderr and exits with 1
-        return err + caught.value.code + "\n"
-
-    yield run
-    torch.set_float32_matmul_precision(precision)
-    torch.set_num_threads(threads)
 
 
 def test_a_run_in_an_empty_directory_writes_everything_and_one_closing_line(finished):
@@ -230,23 +204,24 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("argument", "message"), REFUSED, ids=[argument for argument, _ in REFUSED])
-def test_a_bad_input_ends_in_one_line_and_leaves_nothing_behind(tmp_path, monkeypatch, run_main, argument, message):
+def test_a_bad_input_ends_in_one_line_and_leaves_nothing_behind(tmp_path, monkeypatch, run_here, argument, message):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find_spec(name))
     if argument == "run_dir=taken/run":
         (tmp_path / "taken").write_text("a file, not a folder")
     before = file_hashes(tmp_path)
-    err = run_main(argument)
-    assert err.startswith(f"error: {message}")
-    assert err.count("\n") == 1
+    error, out, err = run_here("train_dmc.py", argument)
+    assert isinstance(error, str)  # Python prints it on stderr and exits with 1
+    assert error.startswith(f"error: {message}")
+    assert (error.count("\n"), out, err) == (0, "", "")
     assert file_hashes(tmp_path) == before
     assert all(path.is_file() for path in tmp_path.iterdir())
 
 
-def test_a_traceback_is_shown_on_request(tmp_path, monkeypatch, run_main):
-    assert run_main("planner.horizon=0").startswith("error: planner.horizon")
+def test_a_traceback_is_shown_on_request(tmp_path, monkeypatch, run_here):
+    assert run_here("train_dmc.py", "planner.horizon=0")[0].startswith("error: planner.horizon")
     monkeypatch.setenv("TORCHRL_ETDMPC_TRACEBACK", "1")
     with pytest.raises(ValueError, match=r"^planner\.horizon must be at least 1, got 0\.$"):
-        run_main("planner.horizon=0")
+        run_here("train_dmc.py", "planner.horizon=0")
     assert list(tmp_path.iterdir()) == []
