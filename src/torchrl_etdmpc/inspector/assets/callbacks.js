@@ -25,8 +25,8 @@ window.dash_clientside = Object.assign({}, window.dash_clientside, {
       });
     },
 
-    // Of a second plan beside the first.
-    fit: function () { requestAnimationFrame(fitFigures); },
+    // Of a second plan beside the first: what stands already; the other side is drawn in the new width.
+    fit: function () { requestAnimationFrame(function () { fitFigures(".side-a"); }); },
 
     ring: function (candidate, plane) {
       moveRing(document.getElementById(plane).querySelector(".js-plotly-plot"), candidate);

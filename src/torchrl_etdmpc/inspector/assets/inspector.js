@@ -17,17 +17,22 @@
   });
 
   // Figures take the width that there is. Their height is their own: following that too, as plotly's and dash's own
-  // ways do, every figure that is drawn resizes those beside it, and they each other.
-  window.fitFigures = function () {
-    document.querySelectorAll(".js-plotly-plot").forEach(function (graph) {
+  // ways do, every figure that is drawn resizes those beside it, and they each other. Within an element, or all.
+  window.fitFigures = function (within) {
+    document.querySelectorAll((within || "") + " .js-plotly-plot").forEach(function (graph) {
       var drawn = graph.querySelector(".main-svg"), width = graph.clientWidth;
       if (drawn && width && Math.abs(drawn.getAttribute("width") - width) > 1) {
         Plotly.relayout(graph, { width: width });
       }
     });
   };
-  new ResizeObserver(function () { requestAnimationFrame(fitFigures); }).observe(document.documentElement);
-  window.matchMedia("print").addEventListener("change", fitFigures);  // at once: paper does not wait
+  var pageWidth = null;
+  new ResizeObserver(function (entries) {
+    if (entries[0].contentRect.width === pageWidth) { return; }  // the page has grown longer, no figure wider
+    pageWidth = entries[0].contentRect.width;
+    requestAnimationFrame(function () { fitFigures(); });
+  }).observe(document.documentElement);
+  window.matchMedia("print").addEventListener("change", function () { fitFigures(); });  // at once: paper does not wait
 
   // A shape of the layout, which is moved without drawing a mark anew; none around no candidate.
   window.moveRing = function (graph, candidate) {
