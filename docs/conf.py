@@ -110,6 +110,7 @@ sphinx_gallery_conf = {
     "ignore_pattern": r"__init__\.py",
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
+    "parallel": 2,  # tutorials at a time, each in a process of its own
     "plot_gallery": "True",
     "download_all_examples": False,
     "remove_config_comments": True,
