@@ -14,7 +14,8 @@ pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
 from torchrl_etdmpc.collectors import evaluate  # noqa: E402
-from torchrl_etdmpc.envs import make_env  # noqa: E402
+from torchrl_etdmpc.envs import get_task, make_env  # noqa: E402
+from torchrl_etdmpc.inspector import with_settings  # noqa: E402
 from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     load_agent,
@@ -104,6 +105,23 @@ def test_the_command_may_change_the_protocol(tmp_path, run_main, save_untrained)
     assert returns[0] < returns[1] < 0  # two decisions from the same state cost more than the first alone
 
 
+def test_the_command_may_change_the_planner(checkpoint, run_main):
+    common = (f"checkpoint={checkpoint}", "episodes=1", "seed=5", "device=cpu", "task.episode_length=40")
+    as_trained = run_main(*common)
+    assert run_main(*common, "planner.horizon=2") == as_trained  # what it was trained with
+    message, out, err = run_main(*common, "planner.horizon=4", "planner.num_samples=20")
+    assert (message, err) == (None, "")
+    assert out.startswith(
+        "cartpole-balance (planner with horizon=4, num_samples=20, trained for 400 env steps): return "
+    )
+    agent, _, _ = load_agent(checkpoint)
+    planner = with_settings(agent.eval_planner, horizon=4, num_samples=20)
+    env = make_env(get_task("cartpole-balance", episode_length=40), seed=5, num_envs=1, parallel=False)
+    torch.manual_seed(5)
+    returns = evaluate(env.append_transform(planner.make_tensordict_primer()), planner, episodes=1).returns
+    assert f"return {returns.mean():.1f} +- " in out
+
+
 def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, save_untrained):
     """Even if it terminates early and others follow."""
     pytest.importorskip("gymnasium")
@@ -141,6 +159,9 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, sav
         (["checkpoint=GOOD", "episodes=0"], "episodes must be at least 1, got 0."),
         (["checkpoint=GOOD", "episodes=many"], "episodes must be of type int, got 'many'."),
         (["checkpoint=GOOD", "policy=best"], "policy must be one of planner, bare, got 'best'."),
+        (["checkpoint=GOOD", "policy=bare", "planner.horizon=4"], "planner.horizon changes nothing with policy=bare, "),
+        (["checkpoint=GOOD", "planner.horizon=0"], "planner.horizon must be at least 1, got 0."),
+        (["checkpoint=GOOD", "planner.horizn=4"], "unknown setting planner.horizn; did you mean planner.horizon?"),
         (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4 or .gif, got 'film.avi'."),
         (["checkpoint=GOOD", "epsiodes=2"], "unknown setting epsiodes; did you mean episodes?"),
         (["checkpoint=GOOD", "device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use "),

@@ -1,12 +1,16 @@
-"""The settings that every command on a trained agent has: which agent, and the task that it plays."""
+"""The settings that commands on a trained agent share: which agent, the task that it plays, and its planner."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from torchrl_etdmpc.envs import Task, get_task
-from torchrl_etdmpc.training import TrainConfig, read_agent_file
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner
+from torchrl_etdmpc.training import Agent, TrainConfig, build_planner, read_agent_file
+from torchrl_etdmpc.training.config import PlannerConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,3 +43,29 @@ class AgentCommandConfig:
         if self.task is not None and self.task != stored["task"]:
             return get_task(self.task, **told)
         return dataclasses.replace(TrainConfig.from_dict(stored).task_spec, **told)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerCommandConfig(AgentCommandConfig):
+    """The same, with settings of the planner: what is not named is as the agent was trained with it."""
+
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+
+    def planner_of(self, agent: Agent) -> EnsembleMPPIPlanner:
+        """A planner on the agent's networks with these settings, as the agent evaluates with."""
+        discount = agent.eval_planner.discount
+        return build_planner(agent.acting_model, self.planner, discount=discount, warm_start=True)
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """The planner's settings that are not those of the agent's training."""
+        stored = TrainConfig.from_dict(read_agent_file(self.checkpoint)["config"]).planner
+        now = dataclasses.asdict(self.planner)
+        return {name: value for name, value in now.items() if getattr(stored, name) != value}
+
+
+def with_the_agent_s_planner(values: dict[str, Any], explicit: list[str]) -> dict[str, Any]:
+    """A command's settings, with those of the planner that it does not name as the agent was trained with them."""
+    stored = read_agent_file(values["checkpoint"])["config"]["planner"]
+    named: Mapping[str, Any] = values["planner"]
+    return {**values, "planner": stored | {name: named[name] for name in named if f"planner.{name}" in explicit}}

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
-from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
+from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
@@ -25,7 +25,7 @@ FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time fo
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(AgentCommandConfig):
+class EvaluateConfig(PlannerCommandConfig):
     """What to evaluate."""
 
     episodes: int = 10
@@ -44,11 +44,14 @@ class EvaluateConfig(AgentCommandConfig):
             raise ValueError(f"episodes must be at least 1, got {self.episodes}.")
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2**32 - 1], got {self.seed}.")
+        if self.policy == "bare" and self.changed:
+            name = next(iter(self.changed))
+            raise ValueError(f"planner.{name} changes nothing with policy=bare, which does not plan; leave one out.")
         if self.video is not None and Path(self.video).suffix not in (".mp4", ".gif"):
             raise ValueError(f"video must end in .mp4 or .gif, got {self.video!r}.")
 
 
-@hydra_main(CONFIG, "evaluate", EvaluateConfig)
+@hydra_main(CONFIG, "evaluate", EvaluateConfig, complete=with_the_agent_s_planner)
 def main(config: EvaluateConfig) -> None:
     """Plays episodes with a trained agent, and films the first one if asked to."""
     device = resolve_device(config.device)
@@ -64,7 +67,7 @@ def main(config: EvaluateConfig) -> None:
     )
     torch.manual_seed(config.seed)
     if config.policy == "planner":
-        policy = agent.eval_planner
+        policy = config.planner_of(agent)
         env = env.append_transform(policy.make_tensordict_primer())
     else:
         policy = BarePolicy(agent.acting_model)
@@ -95,8 +98,10 @@ def main(config: EvaluateConfig) -> None:
 
 def _outcome(config: EvaluateConfig, task: Task, played: Episodes, counters: Mapping[str, int | float]) -> str:
     returns, least = played.returns, success_return(task)
+    settings = ", ".join(f"{name}={value}" for name, value in config.changed.items())
+    who = f"{config.policy} with {settings}" if settings else config.policy
     said = (
-        f"{task.name} ({config.policy}, trained for {counters['env_steps']} env steps): return {returns.mean():.1f} "
+        f"{task.name} ({who}, trained for {counters['env_steps']} env steps): return {returns.mean():.1f} "
         f"+- {returns.std(correction=0):.1f} over {len(returns)} episodes"
     )
     if task.terminates:

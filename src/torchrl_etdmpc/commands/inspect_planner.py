@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,7 @@ import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
-from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
+from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task
@@ -21,12 +20,11 @@ from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page import make_page, serve
 from torchrl_etdmpc.inspector.saved_page import plotly_script, write_page
 from torchrl_etdmpc.inspector.trace import checksum
-from torchrl_etdmpc.training import build_planner, load_agent, read_agent_file, resolve_device
-from torchrl_etdmpc.training.config import PlannerConfig
+from torchrl_etdmpc.training import load_agent, resolve_device
 
 
 @dataclass(frozen=True, kw_only=True)
-class InspectConfig(AgentCommandConfig):
+class InspectConfig(PlannerCommandConfig):
     """What to look at."""
 
     state: str = "random"
@@ -48,7 +46,6 @@ class InspectConfig(AgentCommandConfig):
     """Of the random state and the planner's samples."""
     device: str = "auto"
     """``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"random|(\d{1,9}|replay):\d{1,9}", self.state):
@@ -59,13 +56,6 @@ class InspectConfig(AgentCommandConfig):
             raise ValueError(f"port must be in [0, 65535], got {self.port}.")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must be in [0, 2**31 - 1], got {self.seed}.")
-
-
-def with_the_agent_s_planner(values: dict[str, Any], explicit: list[str]) -> dict[str, Any]:
-    """The command's settings, with those of the planner that it does not name as the agent was trained with them."""
-    stored = read_agent_file(values["checkpoint"])["config"]["planner"]
-    named: Mapping[str, Any] = values["planner"]
-    return {**values, "planner": stored | {name: named[name] for name in named if f"planner.{name}" in explicit}}
 
 
 @hydra_main(CONFIG, "inspect_planner", InspectConfig, complete=with_the_agent_s_planner)
@@ -92,8 +82,6 @@ def _inspection(config: InspectConfig) -> Inspection:
     task = config.task_spec
     _need_no_renderer(task)
     agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off")
-    discount = agent.eval_planner.discount
-    planner = build_planner(agent.acting_model, config.planner, discount=discount, warm_start=True)
     path = Path(config.checkpoint).expanduser()
     about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
     store = CheckpointStore(path.parent)
@@ -102,7 +90,7 @@ def _inspection(config: InspectConfig) -> Inspection:
     except CheckpointError:
         rows = 0  # the agent file is what was asked for
     return Inspection(
-        planner,
+        config.planner_of(agent),
         task,
         bare=config.play == "bare",
         steps=config.steps,
