@@ -3,7 +3,7 @@
     python benchmarks/bf16_scoring.py                 # three runs of 50,000 env steps, two at a time
     python benchmarks/bf16_scoring.py --report-only   # from the committed curves
 
-Trains the cpu preset with bfloat16 for acting and reanalyze and sets the curves beside those of `cpu_learning.py`
+Trains the cpu preset with bfloat16 for acting and reanalyze and sets the curves beside those of `width-64`
 (float32, same seeds); then plans from states of an evaluation episode with both dtypes, the trained weights and the
 same noise. Writes `benchmarks/results/cpu/bf16/`: `seed<k>/eval.csv`, `scores.json` and `README.md`.
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-from cpu_learning import RESULTS, SEEDS, TASKS, run
+from cpu_learning import ENV_STEPS, RESULTS, SEEDS, run
 
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import make_env
@@ -27,6 +27,7 @@ from torchrl_etdmpc.training import load_agent
 FOLDER = RESULTS / "bf16"
 TASK = "walker-stand"
 HALF = ("planner.scoring_dtype=bfloat16", "reanalyze.scoring_dtype=bfloat16")
+WIDTH = ("model.latent_dim=64", "model.mlp_dim=64")  # of the runs in float32
 EVERY = 10  # of the states of an evaluation episode are planned from
 
 
@@ -66,7 +67,7 @@ def compare(checkpoint: Path) -> dict[str, float]:
 def report() -> str:
     """Both curves, and what the scores say."""
     curves = []
-    for name, folder in (("float32", RESULTS / TASK), ("bfloat16", FOLDER)):
+    for name, folder in (("float32", RESULTS / "width-64" / TASK), ("bfloat16", FOLDER)):
         for seed in SEEDS:
             table = pd.read_csv(RunDirectory(folder / f"seed{seed}").eval)
             curves.append(table.assign(scoring=name, seed=seed)[["scoring", "seed", "env_steps", "return_mean"]])
@@ -74,8 +75,8 @@ def report() -> str:
     lines = [
         "# Scoring candidates in bfloat16",
         "",
-        f"Made by `python benchmarks/bf16_scoring.py`: the cpu preset on {TASK}, return of every evaluation",
-        "(mean of 10 episodes) by env steps; the float32 runs are those of `cpu_learning.py`.",
+        f"Made by `python benchmarks/bf16_scoring.py`: the cpu preset at half its width on {TASK}, return of every",
+        "evaluation (mean of 10 episodes) by env steps; the float32 runs are those of `width-64`.",
         "",
         "| scoring | seed | " + " | ".join(map(str, table.columns)) + " |",
         "|---" * (2 + len(table.columns)) + "|",
@@ -101,7 +102,7 @@ def main() -> None:
         keep = ("eval", "summary", "last_agent")
 
         def train(seed: int) -> str:
-            return run(TASK, seed, TASKS[TASK], *HALF, target=FOLDER / f"seed{seed}", keep=keep)
+            return run(TASK, seed, ENV_STEPS, *WIDTH, *HALF, target=FOLDER / f"seed{seed}", keep=keep)
 
         with ThreadPoolExecutor(2) as pool:
             for line in pool.map(train, SEEDS):

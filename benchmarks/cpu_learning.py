@@ -1,6 +1,6 @@
 """Learning runs of the cpu preset: every task and seed, two at a time with one thread each, and a report.
 
-    python benchmarks/cpu_learning.py                        # the committed runs (about two hours on two cores)
+    python benchmarks/cpu_learning.py                        # the committed runs (about three hours on two cores)
     python benchmarks/cpu_learning.py --tasks walker-stand --seeds 1
     python benchmarks/cpu_learning.py --report-only          # from the committed files
 
@@ -28,16 +28,9 @@ from torchrl_etdmpc.runs import RunDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
-TASKS = {
-    "walker-stand": 50_000,
-    "reacher-easy": 50_000,
-    "cartpole-swingup": 50_000,
-    "cup-catch": 50_000,
-    "finger-spin": 60_000,
-    "walker-walk": 60_000,
-}
+TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch", "finger-spin", "walker-walk")
+ENV_STEPS = 50_000
 SEEDS = (1, 2, 3)
-REPORT_ENV_STEPS = 50_000  # up to which the report compares all tasks
 
 
 def run(
@@ -83,7 +76,7 @@ def write_report() -> None:
         str(ROOT / "examples" / "report.py"),
         *map(str, folders()),
         "--budget",
-        str(REPORT_ENV_STEPS),
+        str(ENV_STEPS),
     ]
     # From 20,000 on, where several baselines were evaluated first: the area before is known of these runs alone.
     command += ["--grid-step", "10000", "--grid-start", "20000"]
@@ -95,9 +88,10 @@ def write_readme(table: pd.DataFrame) -> None:
     lines = [
         "# Learning runs of the cpu preset",
         "",
-        "Made by `python benchmarks/cpu_learning.py`: two runs at a time, one thread each. Return of the evaluation",
-        "(mean of 10 episodes, planner without noise) at the end of the budget; wall time includes random phase,",
-        "compilation and evaluations.",
+        "Made by `python benchmarks/cpu_learning.py`, or as the same runs by `examples/suite.py` with the experiment",
+        "`cpu-all`: two at a time, one thread each, with other work beside. Return of the evaluation (mean of 10",
+        "episodes or more, planner without noise) at the end of the budget; wall time includes random phase,",
+        "compilation, evaluations and pauses.",
         "",
         "| task | env steps | seeds | final return: mean (each) | best mean of seeds | wall time, min | decisions/s |",
         "|---|---|---|---|---|---|---|",
@@ -129,16 +123,16 @@ def write_readme(table: pd.DataFrame) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS, metavar="TASK")
+    parser.add_argument("--tasks", nargs="+", default=TASKS, choices=TASKS, metavar="TASK")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--env-steps", type=int, help="default: 50,000 or 60,000, by task")
+    parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     if not arguments.report_only:
         with ThreadPoolExecutor(arguments.jobs) as pool:
             runs = [(task, seed) for seed in arguments.seeds for task in arguments.tasks]
-            for line in pool.map(lambda pair: run(*pair, arguments.env_steps or TASKS[pair[0]]), runs):
+            for line in pool.map(lambda pair: run(*pair, arguments.env_steps), runs):
                 print(line, flush=True)
     write_readme(read_runs(folders()))
     write_report()

@@ -37,8 +37,8 @@ OUT = RESULTS / "early_markers.csv"
 COMMITTED = {
     "Pendulum-v1": RESULTS / "distributed" / "one-process",
     "InvertedPendulum-v5": RESULTS / "termination-head" / "head and partial slices",
-    "walker-walk (width 128)": RESULTS / "width-128" / "walker-walk",
-    "reacher-easy (width 128)": RESULTS / "width-128" / "reacher-easy",
+    "walker-walk": RESULTS / "walker-walk",
+    "reacher-easy": RESULTS / "reacher-easy",
 }
 
 

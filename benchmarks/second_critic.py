@@ -20,7 +20,7 @@ from torchrl_etdmpc.runs import RunDirectory
 
 TASK, ENV_STEPS, PRESET = "walker-stand", 25_000, "tdmpc2-cpu"
 FOLDER = RESULTS / f"tdmpc2-{TASK}"
-BESIDE = RESULTS / "width-128" / TASK
+BESIDE = RESULTS / "make_train"
 
 
 def report() -> str:

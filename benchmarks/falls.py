@@ -1,0 +1,59 @@
+"""How far committed runs fall below an earlier evaluation, beside what ten episodes can tell.
+
+    python benchmarks/falls.py
+
+Of every run of the cpu preset, and of the same at half its width, the largest fall from the best evaluation so far,
+with its standard error: that of two means of independent episodes, which overstates it where both evaluations play the
+same starts. Writes `benchmarks/results/cpu/falls.csv`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+from cpu_learning import RESULTS, SEEDS, TASKS
+
+OUT = RESULTS / "falls.csv"
+
+
+def largest_fall(curve: pd.DataFrame) -> dict[str, float]:
+    """The largest, and after how many env steps it began and ended; no fall is one of 0, at the end."""
+    error = curve["return_std"] / (curve["episodes"] - 1) ** 0.5
+    returns = curve["return_mean"]
+    last = len(curve) - 1
+    begin, end = max(
+        ((int(returns[:place].idxmax()), place) for place in range(1, len(curve))),
+        key=lambda pair: returns[pair[0]] - returns[pair[1]],
+    )
+    if returns[begin] <= returns[end]:
+        begin = end = last
+    fall = returns[begin] - returns[end]
+    known = math.hypot(error[begin], error[end]) if fall else 0.0
+    return {
+        "from_env_steps": curve["env_steps"][begin],
+        "to_env_steps": curve["env_steps"][end],
+        "from_return": round(returns[begin], 1),
+        "fall": round(fall, 1),
+        "standard_error": round(known, 1),
+        "last_return": round(returns[last], 1),
+    }
+
+
+def main() -> None:
+    rows = []
+    for width, folder in ((64, RESULTS / "width-64"), (128, RESULTS)):
+        for task in sorted(TASKS):
+            for seed in SEEDS:
+                file = folder / task / f"seed{seed}" / "eval.csv"
+                rows.append({"width": width, "task": task, "seed": seed} | largest_fall(pd.read_csv(file)))
+    table = pd.DataFrame(rows)
+    table.to_csv(OUT, index=False)
+    clear = table[(table["fall"] > 2 * table["standard_error"]) & (table["fall"] > 0.1 * table["from_return"])]
+    print(f"{len(table)} runs; falls of more than a tenth and two standard errors:")
+    print(clear.to_string(index=False))
+    print(OUT)
+
+
+if __name__ == "__main__":
+    main()
