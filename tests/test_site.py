@@ -128,7 +128,7 @@ def test_the_markers_are_those_of_the_committed_runs():
 def test_the_markers_of_one_s_own_runs_are_printed_and_a_folder_without_any_is_named(tmp_path, capsys):
     markers = runpy.run_path(str(ROOT / "benchmarks" / "early_markers.py"))
     before = markers["OUT"].read_bytes()
-    (own,) = markers["COMMITTED"]["walker-walk (width 128)"].glob("seed1")
+    (own,) = markers["COMMITTED"]["walker-walk"].glob("seed1")
     markers["main"]([f"mine={own}"])
     assert "mine,plan_fallbacks,0,0,0,1," in capsys.readouterr().out
     assert markers["OUT"].read_bytes() == before

@@ -44,9 +44,6 @@ class EvaluateConfig(PlannerCommandConfig):
             raise ValueError(f"episodes must be at least 1, got {self.episodes}.")
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2**32 - 1], got {self.seed}.")
-        if self.policy == "bare" and self.changed:
-            name = next(iter(self.changed))
-            raise ValueError(f"planner.{name} changes nothing with policy=bare, which does not plan; leave one out.")
         if self.video is not None and Path(self.video).suffix not in (".mp4", ".gif"):
             raise ValueError(f"video must end in .mp4 or .gif, got {self.video!r}.")
 
@@ -54,6 +51,9 @@ class EvaluateConfig(PlannerCommandConfig):
 @hydra_main(CONFIG, "evaluate", EvaluateConfig, complete=with_the_agent_s_planner)
 def main(config: EvaluateConfig) -> None:
     """Plays episodes with a trained agent, and films the first one if asked to."""
+    if config.policy == "bare" and config.changed:
+        name = next(iter(config.changed))
+        raise ValueError(f"planner.{name} changes nothing with policy=bare, which does not plan; leave one out.")
     device = resolve_device(config.device)
     task = config.task_spec
     # A film needs the one environment that it shows; otherwise the episodes run side by side.
