@@ -19,11 +19,12 @@ OUT = RESULTS / "falls.csv"
 
 def largest_fall(curve: pd.DataFrame) -> dict[str, float]:
     """The largest, and after how many env steps it began and ended; no fall is one of 0, at the end."""
-    error = curve["return_std"] / (curve["episodes"] - 1) ** 0.5
-    returns = curve["return_mean"]
-    last = len(curve) - 1
+    error: list[float] = (curve["return_std"] / (curve["episodes"] - 1) ** 0.5).tolist()
+    returns: list[float] = curve["return_mean"].tolist()
+    steps: list[int] = curve["env_steps"].tolist()
+    last = len(returns) - 1
     begin, end = max(
-        ((int(returns[:place].idxmax()), place) for place in range(1, len(curve))),
+        ((returns.index(max(returns[:place])), place) for place in range(1, len(returns))),
         key=lambda pair: returns[pair[0]] - returns[pair[1]],
     )
     if returns[begin] <= returns[end]:
@@ -31,8 +32,8 @@ def largest_fall(curve: pd.DataFrame) -> dict[str, float]:
     fall = returns[begin] - returns[end]
     known = math.hypot(error[begin], error[end]) if fall else 0.0
     return {
-        "from_env_steps": curve["env_steps"][begin],
-        "to_env_steps": curve["env_steps"][end],
+        "from_env_steps": steps[begin],
+        "to_env_steps": steps[end],
         "from_return": round(returns[begin], 1),
         "fall": round(fall, 1),
         "standard_error": round(known, 1),
