@@ -136,6 +136,32 @@ def test_the_markers_of_one_s_own_runs_are_printed_and_a_folder_without_any_is_n
         markers["main"]([f"mine={tmp_path}"])
 
 
+def test_the_largest_falls_are_those_of_the_committed_curves(monkeypatch, tmp_path, capsys):
+    pd = pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    falls = runpy.run_path(str(ROOT / "benchmarks" / "falls.py"))
+    sys.modules.pop("cpu_learning", None)
+    curve = {"env_steps": [0, 10, 20, 30], "return_mean": [5.0, 90.0, 40.0, 80.0]}
+    found = falls["largest_fall"](pd.DataFrame(curve | {"return_std": [0.0, 9.0, 12.0, 6.0], "episodes": [10] * 4}))
+    assert found == {
+        "from_env_steps": 10,
+        "to_env_steps": 20,
+        "from_return": 90.0,
+        "fall": 50.0,
+        "standard_error": 5.0,  # 3 and 4
+        "last_return": 80.0,
+    }
+    committed = falls["OUT"].read_text()
+    falls["main"].__globals__["OUT"] = tmp_path / "falls.csv"
+    falls["main"]()
+    assert (tmp_path / "falls.csv").read_text() == committed
+    study = (ROOT / "docs" / "studies" / "stability.md").read_text(encoding="utf-8")
+    for row in capsys.readouterr().out.splitlines()[2:-1]:
+        width, task, seed, begin, end, before, fall, error, last = row.split()
+        steps = f"{int(begin):,} to {int(end):,}"
+        assert f"| {width} | {task}, {seed} | {steps} | {before} | {fall} | {error} | {last} |" in study
+
+
 def test_the_commands_explain_themselves(generate):
     from torchrl_etdmpc.commands import _COMMANDS
 
