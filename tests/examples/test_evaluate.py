@@ -7,13 +7,14 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
 pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.collectors import evaluate  # noqa: E402
+from torchrl_etdmpc.collectors import Episodes, evaluate  # noqa: E402
 from torchrl_etdmpc.envs import get_task, make_env  # noqa: E402
 from torchrl_etdmpc.inspector import with_settings  # noqa: E402
 from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
@@ -68,6 +69,37 @@ def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint,
     env = make_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
     assert out == closing_line(evaluate(env, BarePolicy(agent.world_model), episodes=2).returns, "bare") + "\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_every_episode_has_its_line_in_a_table(tmp_path, checkpoint, run_main):
+    message, out, err = run_main(
+        f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "seed=5", "device=cpu", "csv=a.csv"
+    )
+    assert (message, err) == (None, "")
+    assert out.endswith(" over 3 episodes; episodes in a.csv\n")
+    agent, _, _ = load_agent(checkpoint)
+    env = make_env("cartpole-balance", seed=5, num_envs=3, parallel=False)
+    played = evaluate(env, BarePolicy(agent.world_model), episodes=3)
+    assert len(set(played.returns.tolist())) == 3
+    table = pd.read_csv(tmp_path / "a.csv")
+    assert list(table.columns) == ["episode", "return", "decisions"]
+    assert table["episode"].tolist() == [0, 1, 2]
+    assert table["return"].tolist() == played.returns.tolist()
+    assert table["decisions"].tolist() == [500, 500, 500]
+
+
+def test_the_table_says_which_episodes_are_a_success(tmp_path, monkeypatch, checkpoint, run_main):
+    returns = torch.tensor([80.0, 120.0, 100.0])
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.success_return", lambda task: 100.0)
+    monkeypatch.setattr(
+        "torchrl_etdmpc.commands.evaluate.evaluate", lambda *args, **options: Episodes(returns, torch.tensor([9, 7, 8]))
+    )
+    message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=3", "device=cpu", "csv=a.csv")
+    assert (message, err) == (None, "")
+    assert ", 2 of them at 100 or more, a success; episodes in a.csv" in out
+    assert (tmp_path / "a.csv").read_text() == (
+        "episode,return,decisions,success\n0,80.0,9,0\n1,120.0,7,1\n2,100.0,8,1\n"
+    )
 
 
 def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_main):
@@ -163,6 +195,9 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, sav
         (["checkpoint=GOOD", "planner.horizon=0"], "planner.horizon must be at least 1, got 0."),
         (["checkpoint=GOOD", "planner.horizn=4"], "unknown setting planner.horizn; did you mean planner.horizon?"),
         (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4 or .gif, got 'film.avi'."),
+        (["checkpoint=GOOD", "video=noise.pt/film.mp4"], "noise.pt/film.mp4 cannot be written (File exists); choose "),
+        (["checkpoint=GOOD", "csv=a.txt"], "csv must end in .csv, got 'a.txt'."),
+        (["checkpoint=GOOD", "csv=noise.pt/b/a.csv"], "noise.pt/b/a.csv cannot be written (Not a directory); choose "),
         (["checkpoint=GOOD", "epsiodes=2"], "unknown setting epsiodes; did you mean episodes?"),
         (["checkpoint=GOOD", "device=cuda"], "device=cuda needs a CUDA device and this PyTorch sees none; use "),
     ],

@@ -1,7 +1,9 @@
-"""``evaluate``: returns of whole episodes with the planner or with the bare policy, and a film if asked for."""
+"""``evaluate``: returns of whole episodes with the planner or with the bare policy, and a film and a table if asked for."""
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
+from torchrl_etdmpc.runs.files import write_whole
 from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
 
@@ -34,6 +37,8 @@ class EvaluateConfig(PlannerCommandConfig):
     """``bare`` is the policy network without the planner."""
     video: str | None = None
     """A file that ends in .mp4 or .gif, for a film of the first episode."""
+    csv: str | None = None
+    """A file that ends in .csv, for the return and the decisions of every episode."""
     seed: int = 0
     """Of the initial states and the planner's samples."""
     device: str = "auto"
@@ -46,6 +51,8 @@ class EvaluateConfig(PlannerCommandConfig):
             raise ValueError(f"seed must be in [0, 2**32 - 1], got {self.seed}.")
         if self.video is not None and Path(self.video).suffix not in (".mp4", ".gif"):
             raise ValueError(f"video must end in .mp4 or .gif, got {self.video!r}.")
+        if self.csv is not None and Path(self.csv).suffix != ".csv":
+            raise ValueError(f"csv must end in .csv, got {self.csv!r}.")
 
 
 @hydra_main(CONFIG, "evaluate", EvaluateConfig, complete=with_the_agent_s_planner)
@@ -54,6 +61,9 @@ def main(config: EvaluateConfig) -> None:
     if config.policy == "bare" and config.changed:
         name = next(iter(config.changed))
         raise ValueError(f"planner.{name} changes nothing with policy=bare, which does not plan; leave one out.")
+    for file in (config.video, config.csv):
+        if file is not None:
+            _make_folder(Path(file))
     device = resolve_device(config.device)
     task = config.task_spec
     # A film needs the one environment that it shows; otherwise the episodes run side by side.
@@ -92,8 +102,30 @@ def main(config: EvaluateConfig) -> None:
     )
     if config.video:
         write_film(frames, config.video, fps=FRAMES_PER_SECOND)
+    if config.csv:
+        write_whole(Path(config.csv), _table(task, played))
     env.close(raise_if_closed=False)
-    print(_outcome(config, task, played, counters) + (f"; film in {config.video}" if config.video else ""))
+    files = [f"; {what} in {file}" for what, file in (("film", config.video), ("episodes", config.csv)) if file]
+    print(_outcome(config, task, played, counters) + "".join(files))
+
+
+def _make_folder(file: Path) -> None:
+    """Makes the folder of a file, or says before the episodes that it cannot be written there."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(file.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise ValueError(f"{file} cannot be written ({error.strerror}); choose another path.") from error
+
+
+def _table(task: Task, played: Episodes) -> str:
+    """One line per episode, in the order of the initial states."""
+    least = success_return(task)
+    rows = ["episode,return,decisions" + (",success" if least is not None else "")]
+    for episode, (value, length) in enumerate(zip(played.returns.tolist(), played.lengths.tolist(), strict=True)):
+        rows.append(f"{episode},{value},{length}" + (f",{int(value >= least)}" if least is not None else ""))
+    return "\n".join([*rows, ""])
 
 
 def _outcome(config: EvaluateConfig, task: Task, played: Episodes, counters: Mapping[str, int | float]) -> str:
