@@ -104,3 +104,10 @@ def test_a_nan_that_counts_leaves_the_scale_where_it_is(counts):
     batch = torch.linspace(0, 1000, 9)
     batch[3] = torch.nan
     assert updated_scale(torch.tensor(7.0), batch, 0.5, counts) == 7
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_has_a_scale_too(dtype):
+    scale = updated_scale(torch.tensor(1.0, dtype=dtype), torch.linspace(0, 100, 101, dtype=dtype), tau=1.0)
+    assert scale.dtype == dtype
+    assert scale.item() == pytest.approx(90, abs=1)

@@ -166,3 +166,14 @@ def test_termination_is_a_probability_from_the_heads_logit(build, randomised):
     torch.testing.assert_close(model.termination(latent), torch.sigmoid(model.termination_head(latent)))
     fresh = build(termination=True).termination(latent)
     torch.testing.assert_close(fresh, torch.full((7,), 0.5), rtol=0, atol=0.1)
+
+
+def test_observations_of_another_dtype_say_how_to_cast_them(build):
+    model, observation = build(), torch.zeros(4, build().observation_dim, dtype=torch.float64)
+    with pytest.raises(
+        TypeError, match=r"observations are torch.float64 and the weights torch.float32; append torchrl"
+    ):
+        model.encode(observation)
+    assert model.double().encode(observation).dtype == torch.float64
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert model.float().encode(observation.float()).shape == (4, model.latent_dim)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from torch import nn
 
 from torchrl_etdmpc import functional
@@ -69,3 +70,9 @@ def test_the_activation_reaches_every_network(build):
     for name in networks:
         activations = [{layer.activation for layer in getattr(m, name).hidden} for m in (mish, relu)]
         assert activations == [{functional.mish}, {nn.functional.relu}], name
+
+
+def test_an_encoder_that_is_empty_is_still_the_encoder(build):
+    model = build(encoder=nn.Sequential())
+    latent = torch.rand(5, model.latent_dim)
+    assert torch.equal(model.encode(latent), latent)

@@ -71,3 +71,10 @@ def test_the_compiled_loss_equals_the_eager_one_in_numbers_gradients_and_scale(
         assert actual["kl_scale"] == loss.kl_scale != 1.0 + seed
         expected, actual = gradients(total(expected), world_model), gradients(total(actual), world_model)
         assert_same_gradients(actual, expected)
+
+
+@pytest.mark.parametrize("key", ["loc", "scale"])
+def test_a_plan_of_another_action_is_refused(make_loss, slices, key):
+    slices["plan", key] = slices["plan", key][..., :1]
+    with pytest.raises(ValueError, match=rf"got \('plan', '{key}'\) of shape \[\d+, \d+, 1\]"):
+        make_loss("policy")(slices)

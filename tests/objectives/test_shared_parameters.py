@@ -146,3 +146,29 @@ def test_copying_a_loss_together_with_its_world_model_keeps_them_shared(loss, wo
     world_model_twin, twin = copy.deepcopy((world_model, loss))
     assert twin.world_model is world_model_twin
     assert _identities(twin) <= _identities(world_model_twin)
+
+
+def test_weights_that_others_took_the_place_of_are_noticed(make_loss, make_world_model, slices):
+    loss = make_loss("whole")
+    loss.world_model.load_state_dict(make_world_model().state_dict(), assign=True)
+    with pytest.raises(
+        RuntimeError, match=r"the weights of world_model\.encoder are others than this loss trains: load_"
+    ):
+        loss(slices)
+    loss = make_loss("whole")
+    loss.world_model.policy = make_world_model().policy
+    with pytest.raises(RuntimeError, match=r"the weights of world_model\.policy are others than this loss trains"):
+        loss(slices)
+    loss = make_loss("whole")
+    loss.world_model.load_state_dict(make_world_model().state_dict())
+    loss(slices)
+
+
+def test_a_world_model_that_was_cast_without_its_loss_is_noticed(make_loss, slices):
+    loss = make_loss("whole")
+    loss.world_model.double()
+    with pytest.raises(
+        RuntimeError, match=r"is torch\.float64 on cpu, its targets are torch\.float32 on cpu; .* loss\.to"
+    ):
+        loss(slices.double())
+    loss.double()(slices.double())

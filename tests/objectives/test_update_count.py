@@ -39,6 +39,16 @@ def test_of_the_optimizers_that_share_the_networks_one_counts(make_loss, world_m
     assert world_model.version == 3
 
 
+@pytest.mark.parametrize("frozen", ["before", "after"])
+def test_an_optimizer_need_not_hold_what_is_frozen(make_loss, world_model, slices, total, frozen):
+    if frozen == "before":
+        world_model.encoder.requires_grad_(False)
+    loss = make_loss("whole", world_model)
+    world_model.encoder.requires_grad_(False)
+    train(loss, torch.optim.Adam([p for p in loss.parameters() if p.requires_grad]), slices=slices, total=total)
+    assert world_model.version == 3
+
+
 def test_losses_that_share_a_world_model_count_a_step_once(make_world_model, slices, total):
     model = make_world_model()
     losses = [

@@ -119,3 +119,13 @@ def test_an_exported_program_does_not_follow_the_live_weights():
 def test_no_batch_is_refused():
     with pytest.raises(ValueError, match=r"^batch_size must be at least 1, got 0\.$"):
         export_planner(make_planner(make_model()), batch_size=0)
+
+
+@pytest.mark.parametrize(
+    "export", [lambda model, **o: export_policy(model, **o), lambda m, **o: export_planner(make_planner(m), **o)]
+)
+def test_an_example_that_is_no_tensor_is_refused(export):
+    with pytest.raises(
+        TypeError, match="observation must be a tensor, got dict; a model that encodes dictionaries cannot"
+    ):
+        export(make_model(), observation={"pixels": torch.zeros(3)})

@@ -52,6 +52,21 @@ def test_a_reset_encodes_the_observation():
     assert not start["done"].any()
 
 
+def test_a_reset_encodes_what_stands_under_another_key():
+    model, observation = make_model(), torch.randn(5, 3)
+    start = LatentEnv(model, observation_key=("sensors", "all")).reset(
+        TensorDict({"sensors": {"all": observation}}, batch_size=[5])
+    )
+    torch.testing.assert_close(start["latent"], model.encode(observation))
+
+
+def test_a_reset_from_states_that_it_does_not_know_is_refused():
+    states = TensorDict({"state": torch.randn(5, 3), "done": torch.zeros(5, 1, dtype=torch.bool)}, batch_size=[5])
+    with pytest.raises(KeyError, match="LatentEnv starts from 'latent' or 'observation', got 'state'; pass LatentEnv"):
+        LatentEnv(make_model()).reset(states)
+    assert LatentEnv(make_model()).reset(states.exclude("state"))["latent"].shape == (5, 16)
+
+
 def test_a_reset_takes_a_latent_as_it_is():
     latent = torch.rand(2, 4, 16)
     start = LatentEnv(make_model()).reset(TensorDict({"latent": latent}, batch_size=[2, 4]))

@@ -110,3 +110,15 @@ def test_the_planner_keeps_nothing_from_call_to_call(make_planner, states, run):
 def test_the_primer_describes_the_warm_start(make_planner):
     primer = make_planner(horizon=4, plan_mean_key=("agent", "carried")).make_tensordict_primer()
     assert primer.primers["agent", "carried"].shape == (4, 2)
+
+
+def test_an_episode_flag_may_lack_its_last_dimension(make_planner, states, run):
+    # As many environments as steps: each flag must zero its environment, not a step of every one.
+    planner = make_planner(warm_start=True)
+    td = TensorDict({"observation": states(3), "plan_mean": torch.rand(3, 3, 2, dtype=torch.float64)}, batch_size=[3])
+    flag = torch.tensor([True, False, False])
+    plans = [run(planner, td.clone().set("is_init", init))["next", "plan_mean"] for init in (flag, flag.unsqueeze(-1))]
+    assert torch.equal(*plans)
+    assert not torch.equal(
+        plans[0], run(planner, td.clone().set("is_init", torch.zeros(3, 1).bool()))["next", "plan_mean"]
+    )

@@ -12,12 +12,16 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import (
+    ImmutableDatasetWriter,
     LazyMemmapStorage,
     LazyTensorStorage,
     ListStorage,
     RandomSampler,
+    ReplayBuffer,
+    TensorDictMaxValueWriter,
     TensorDictReplayBuffer,
     TensorDictRoundRobinWriter,
+    TensorStorage,
 )
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
@@ -570,6 +574,68 @@ def test_rows_that_were_written_past_the_sampler_are_noticed():
         RuntimeError, match="saw 12 writes but the storage holds 16 of 20 rows; write through this buffer"
     ):
         ring.draw(1)
+
+
+@pytest.mark.parametrize("number", [1, 4, 23])
+def test_rows_that_were_written_past_the_sampler_into_a_full_ring_are_noticed(number):
+    ring = Ring(20, 3)
+    ring.write(contiguous([5], 27))
+    ring.draw(1)
+    ring.write(contiguous([5], 6))
+    ring.draw(1)
+    ring.buffer.set_sampler(RandomSampler())
+    ring.write(contiguous([5], number))
+    ring.buffer.set_sampler(ring.sampler)
+    with pytest.raises(
+        RuntimeError, match="saw 33 writes but the storage holds 20 of 20 rows; write through this buff"
+    ):
+        ring.draw(1)
+
+
+def test_rows_of_a_writer_that_leaves_their_order_are_refused():
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(20),
+        sampler=StepSliceSampler(3),
+        writer=TensorDictMaxValueWriter(rank_key="reward"),
+        batch_size=30,
+    )
+    buffer.extend(_rows([0] * 20, reward=torch.arange(20.0)))
+    with pytest.raises(
+        TypeError, match=r"TensorDictMaxValueWriter does not keep; .* writer=TensorDictRoundRobinWriter"
+    ):
+        buffer.sample()
+
+
+def test_partial_slices_are_refused_by_a_buffer_that_leaves_the_mask_out():
+    for kind in (ReplayBuffer, TensorDictReplayBuffer):
+        buffer = kind(storage=LazyTensorStorage(20), sampler=StepSliceSampler(3, partial=True), batch_size=30)
+        buffer.extend(_rows([0] * 5 + [1] * 5, done=[4, 9]))
+        if kind is TensorDictReplayBuffer:
+            assert ("collector", "mask") in buffer.sample().keys(True)
+        else:
+            with pytest.raises(TypeError, match="which ReplayBuffer leaves out; use TensorDictReplayBuffer"):
+                buffer.sample()
+
+
+def test_a_data_set_that_fills_its_storage_is_sampled_from_its_first_row_on():
+    rows = _rows([0] * 6 + [1] * 7 + [2] * 7)
+    buffer = TensorDictReplayBuffer(
+        storage=TensorStorage(rows),
+        sampler=StepSliceSampler(3, as_slices=True),
+        writer=ImmutableDatasetWriter(),
+        batch_size=6000,
+    )
+    starts = set(buffer.sample()["t"][:, 0].tolist())
+    assert starts == {0, 1, 2, 3, *range(6, 11), *range(13, 18)}
+
+
+def test_a_buffer_that_another_sampler_dumped_is_read_anew(tmp_path):
+    other = TensorDictReplayBuffer(storage=LazyTensorStorage(50))
+    other.extend(_rows([0] * 5 + [1] * 5))
+    other.dumps(tmp_path)
+    buffer = _buffer(3)
+    buffer.loads(tmp_path)
+    assert _drawn(buffer, 3) == {(t, t + 1, t + 2) for t in (0, 1, 2, 5, 6, 7)}
 
 
 @pytest.mark.parametrize("steps", [1, 5])

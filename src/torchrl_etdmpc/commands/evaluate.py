@@ -1,4 +1,4 @@
-"""``evaluate``: returns of whole episodes with the planner or with the bare policy, and a film and a table if asked for."""
+"""``evaluate``: returns of whole episodes with the planner or with the bare policy; a film and a table if asked for."""
 
 from __future__ import annotations
 

@@ -25,6 +25,8 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | Non
     90.0
     """
     batch = batch.detach().flatten()
+    if batch.dtype != torch.float64:  # torch.quantile takes no half precision
+        batch = batch.float()
     levels = torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device)
     if counts is None:
         quantiles = torch.quantile(batch, levels)

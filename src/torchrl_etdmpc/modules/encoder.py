@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
+import torch
+from torch import Tensor
+
 from torchrl_etdmpc.functional import simnorm
 from torchrl_etdmpc.modules.normed_linear import MLP, Activation
 
@@ -19,7 +22,9 @@ class Encoder(MLP):
         simnorm_dim (int): group size of SimNorm.
         activation (str): of the hidden layers.
 
-    >>> import torch
+    Raises:
+        TypeError: if an observation has another dtype than the weights.
+
     >>> Encoder(24, 512)(torch.zeros(2, 24)).shape
     torch.Size([2, 512])
     """
@@ -41,3 +46,13 @@ class Encoder(MLP):
             activation=activation,
             output_activation=partial(simnorm, group_size=simnorm_dim),
         )
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """``[..., O] -> [..., L]``."""
+        dtype = self.output.weight.dtype
+        if observation.dtype != dtype and not torch.is_autocast_enabled(observation.device.type):
+            raise TypeError(
+                f"observations are {observation.dtype} and the weights {dtype}; append torchrl.envs.DoubleToFloat() to "
+                "the environment, or cast one of the two with .to(dtype)."
+            )
+        return self.through(observation)

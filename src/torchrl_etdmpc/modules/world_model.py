@@ -118,14 +118,16 @@ class WorldModel(nn.Module):
         self.latent_dim = latent_dim
         self.num_dynamics = num_dynamics
         self.num_values = num_values
-        self.encoder = encoder or Encoder(
-            sizes["observation_dim"],
-            latent_dim,
-            hidden_dim=encoder_dim,
-            num_layers=encoder_layers,
-            simnorm_dim=simnorm_dim,
-            activation=activation,
-        )
+        if encoder is None:
+            encoder = Encoder(
+                sizes["observation_dim"],
+                latent_dim,
+                hidden_dim=encoder_dim,
+                num_layers=encoder_layers,
+                simnorm_dim=simnorm_dim,
+                activation=activation,
+            )
+        self.encoder = encoder
         self.dynamics = DynamicsEnsemble(
             latent_dim,
             action_dim,

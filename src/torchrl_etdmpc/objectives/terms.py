@@ -399,7 +399,10 @@ class LatentRolloutLoss(LossModule):
                 a row of a CPU tensor terminates although the world model has no termination head. Elsewhere that
                 check would wait for the device and is skipped.
             KeyError: if a key is missing.
+            RuntimeError: if the world model's weights are no longer those that this loss trains, or its targets are
+                elsewhere.
         """
+        self._refuse_other_weights()
         reads = self._reads()
         entries: dict[NestedKey, Any] = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
         for name in _OBSERVATIONS:
@@ -437,7 +440,31 @@ class LatentRolloutLoss(LossModule):
         vector = name in _FEATURES or (name in _OBSERVATIONS and self.world_model.observation_dim is not None)
         if value.ndim != 3 if vector else value.ndim < 2:
             raise self._shape_error(key, value)
+        if name in ("plan_loc", "plan_scale") and value.shape[-1] != self.world_model.action_dim:
+            raise self._shape_error(key, value)  # a last dimension of 1 would be spread over the action
         return value
+
+    def _refuse_other_weights(self) -> None:
+        if torch.compiler.is_compiling():
+            return
+        for name, attribute in self._attributes.items():
+            held: Any = self._modules.get(f"{name}_params")
+            if held is None:
+                continue
+            now, trained = next(getattr(self.world_model, attribute).parameters()), _first(held)
+            if now is not trained:
+                raise RuntimeError(
+                    f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
+                    "assign=True) and a new module put new parameters there; load without assign, or build the loss "
+                    "and its optimizer afterwards."
+                )
+            target: Any = self._modules.get(f"target_{name}_params")
+            if target is not None and (_first(target).dtype, _first(target).device) != (now.dtype, now.device):
+                raise RuntimeError(
+                    f"world_model.{attribute} is {now.dtype} on {now.device}, its targets are {_first(target).dtype} "
+                    f"on {_first(target).device}; move or cast the loss, which takes the world model along: "
+                    "loss.to(...)."
+                )
 
     def _shape_error(self, key: NestedKey, value: Tensor | TensorDictBase) -> ValueError:
         return ValueError(
@@ -564,6 +591,10 @@ class LatentRolloutLoss(LossModule):
         """Weights ``[T, B]`` errors by ``rho^k``."""
         powers = self.rho ** torch.arange(error.shape[0], device=error.device, dtype=error.dtype)
         return error * powers.unsqueeze(-1)
+
+
+def _first(params: Any) -> Tensor:
+    return next(iter(params.values(True, True)))
 
 
 def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:

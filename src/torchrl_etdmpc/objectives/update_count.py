@@ -15,8 +15,11 @@ from torchrl_etdmpc.modules import WorldModel
 
 
 class _Count(NamedTuple):
-    first: nn.Parameter
-    """Of the parameters that are trained: the optimiser that holds it makes the updates."""
+    trained: tuple[nn.Parameter, ...]
+    """In the model's order."""
+    first: int
+    """The first of them that an optimiser which has stepped holds: that optimiser makes the updates. An optimiser need
+    not hold those that are frozen."""
     after: Tensor
     """The version that the last counted step left behind."""
 
@@ -28,7 +31,8 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
     """Lets every step of a PyTorch optimiser that trains the world model count as one in ``world_model.version``.
 
     A step is what every pipeline has: a target average is not there in a loss without values, and a backward pass need
-    not be followed by a step. Where several optimisers share the networks out, that of the first one counts.
+    not be followed by a step. Where several optimisers share the networks out, that of the first one counts, from
+    its first step on.
 
     A line that counts by hand is harmless: after a step that somebody else has counted, the next one is not counted
     again, so that such a pipeline is one ahead and stays so.
@@ -40,10 +44,9 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
     _listen()
     known = {id(parameter) for parameter in trained}
     if world_model in _counts:
-        known.add(id(_counts[world_model].first))
-    first = next((parameter for parameter in world_model.parameters() if id(parameter) in known), None)
-    if first is not None:
-        _counts[world_model] = _Count(first, world_model.version.clone())
+        known |= {id(parameter) for parameter in _counts[world_model].trained}
+    ordered = tuple(parameter for parameter in world_model.parameters() if id(parameter) in known)
+    _counts[world_model] = _Count(ordered, len(ordered), world_model.version.clone())
 
 
 def restart_count(world_model: nn.Module) -> None:
@@ -60,7 +63,9 @@ def _listen() -> None:
 def _count(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
     held = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
     for world_model, count in list(_counts.items()):
-        if id(count.first) in held:
+        first = next((place for place, parameter in enumerate(count.trained) if id(parameter) in held), None)
+        if first is not None and first <= count.first:
+            _counts[world_model] = count._replace(first=first)
             version = world_model.get_buffer("version")
             version += version != count.after.to(version.device) + 1
             restart_count(world_model)

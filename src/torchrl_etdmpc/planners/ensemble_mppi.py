@@ -333,9 +333,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         explore = exploration_type() is ExplorationType.RANDOM
         carried, carry = self._read_warm_start(tensordict)
         make_plan = self.plan if self.compiled_plan is None else self.compiled_plan
-        drawn: dict[str, Any] = (
-            {} if generator is None else {"noise": self.draw_noise(*tensordict.batch_size, generator=generator)}
-        )
+        drawn: dict[str, Any] = {}
+        if generator is not None:
+            states = observation if latent is None else latent
+            vectors = latent is not None or self.world_model.observation_dim is not None
+            batch = states.shape[:-1] if vectors else tensordict.batch_size  # which may be shorter than the entries'
+            drawn["noise"] = self.draw_noise(*batch, generator=generator)
         plan = make_plan(observation, carried, latent=latent, explore=explore, **drawn)
         outputs = {
             self._written[0]: plan.action,
@@ -369,7 +372,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 )
             return None, is_init is not None
         if is_init is not None:
-            carried = torch.where(is_init.unsqueeze(-1), torch.zeros_like(carried), carried)
+            starts = is_init.reshape(*carried.shape[:-2], 1, 1)  # [..., 1], or [...] as some environments write it
+            carried = torch.where(starts, torch.zeros_like(carried), carried)
         return carried, True
 
     def draw_noise(

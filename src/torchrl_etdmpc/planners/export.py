@@ -49,7 +49,7 @@ def export_policy(world_model: PolicyModel, *, observation: Tensor | None = None
         ExportedProgram: for ``torch.export.save``; to run it, ``torch.export.load(file).module()(observation)``.
 
     Raises:
-        TypeError: if the model has no policy.
+        TypeError: if the model has no policy, or the example is no tensor.
         ValueError: if an example is needed.
 
     >>> from torchrl_etdmpc.modules import WorldModel
@@ -83,6 +83,7 @@ def export_planner(
         ExportedProgram: for ``torch.export.save``.
 
     Raises:
+        TypeError: if the example is no tensor.
         ValueError: if ``batch_size`` is below 1, or an example is needed.
 
     >>> from torchrl_etdmpc import LatentEnv, WorldModel
@@ -111,6 +112,11 @@ def _observations(
     model: PredictionModel, example: Tensor | None, states: int, device: torch.device, dtype: torch.dtype
 ) -> Tensor:
     if example is not None:
+        if not isinstance(example, Tensor):
+            raise TypeError(
+                f"observation must be a tensor, got {type(example).__name__}; a model that encodes dictionaries cannot "
+                "be exported."
+            )
         return example.to(device).expand(states, *example.shape).contiguous()
     if model.observation_dim is None:
         raise ValueError(

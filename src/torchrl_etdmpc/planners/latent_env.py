@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
-from torchrl_etdmpc.keys import ACTION, DONE, LATENT, OBSERVATION, REWARD, TERMINATED
+from torchrl_etdmpc.keys import ACTION, DONE, LATENT, NEXT, OBSERVATION, REWARD, TERMINATED
 from torchrl_etdmpc.modules.prediction import PredictionModel, device_and_dtype, require_prediction_model
 
 
@@ -27,6 +27,7 @@ class LatentEnv(ModelBasedEnvBase):
 
     Keyword Args:
         head (int, optional): dynamics head to roll. Default: ``None``, the average of all heads' predictions.
+        observation_key (NestedKey): what a reset encodes. Default: ``"observation"``.
         device (torch.device or str, optional): for a model without parameters and buffers; of any other the device is
             known. Default: PyTorch's own.
         dtype (torch.dtype, optional): the same. Default: PyTorch's own.
@@ -34,6 +35,7 @@ class LatentEnv(ModelBasedEnvBase):
     Raises:
         TypeError: if the model lacks a member of :class:`~torchrl_etdmpc.modules.PredictionModel`.
         ValueError: if ``head`` does not exist.
+        KeyError: at a reset from a tensordict that has neither a latent nor an observation, but something else.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> env = LatentEnv(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
@@ -49,6 +51,7 @@ class LatentEnv(ModelBasedEnvBase):
         world_model: PredictionModel,
         *,
         head: int | None = None,
+        observation_key: NestedKey = OBSERVATION,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
@@ -58,6 +61,7 @@ class LatentEnv(ModelBasedEnvBase):
         device, dtype = device_and_dtype(world_model, device, dtype)
         super().__init__(world_model, device=device)  # pyright: ignore[reportArgumentType]  # any module will do
         self.head = head
+        self.observation_key = unravel_key(observation_key)
         self._set_specs(device, dtype)
 
     def _apply(self, fn: Any, *args: Any, **kwargs: Any) -> Any:
@@ -97,7 +101,9 @@ class LatentEnv(ModelBasedEnvBase):
         A model that encodes what it likes starts from an all-zero latent then.
         """
         model = self.world_model
-        if tensordict is None or (LATENT not in tensordict.keys() and OBSERVATION not in tensordict.keys()):
+        observation = None if tensordict is None else tensordict.get(self.observation_key, None)
+        if tensordict is None or (LATENT not in tensordict.keys() and observation is None):
+            self._refuse_other_states(tensordict)
             batch_size = self.batch_size if tensordict is None else tensordict.batch_size
             device, dtype = self.device_and_dtype()
             if model.observation_dim is None:
@@ -107,9 +113,19 @@ class LatentEnv(ModelBasedEnvBase):
         elif LATENT in tensordict.keys():
             batch_size, latent = tensordict.batch_size, tensordict.get(LATENT)
         else:
-            batch_size, latent = tensordict.batch_size, model.encode(tensordict.get(OBSERVATION))
+            batch_size, latent = tensordict.batch_size, model.encode(observation)
         done = torch.zeros(*batch_size, 1, dtype=torch.bool, device=latent.device)
         return TensorDict({LATENT: latent, DONE: done, TERMINATED: done.clone()}, batch_size=batch_size)
+
+    def _refuse_other_states(self, tensordict: TensorDictBase | None) -> None:
+        """A tensordict of states under names that this environment does not know would start it from zeros."""
+        own = {key for spec in (self.full_done_spec, self.full_reward_spec, self.full_action_spec) for key in spec}
+        found = [] if tensordict is None else [key for key in tensordict.keys() if key not in own | {"_reset", NEXT}]
+        if found:
+            raise KeyError(
+                f"LatentEnv starts from {LATENT!r} or {self.observation_key!r}, got {', '.join(map(repr, found))}; "
+                "pass LatentEnv(..., observation_key=...)."
+            )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         model = self.world_model

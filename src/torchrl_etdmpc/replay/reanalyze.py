@@ -24,6 +24,9 @@ class ReanalyzeTransform(Transform):
     and, through the buffer's generation-checked update, those in the buffer: a row that was overwritten in the meantime
     is left alone and counted as stale. A row that the slices share is given one target.
 
+    Read ``buffer.storage[...]`` to look at rows: TorchRL sends ``buffer[...]`` through the transforms as if it were a
+    sample.
+
     The planner is any TensorDict module that reads an observation and writes the targets below ``plan_key``; it is
     called in the exploring mode and without a warm start.
 
@@ -143,8 +146,11 @@ class ReanalyzeTransform(Transform):
         return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Called on every sample ``[B * T]`` or ``[B, T]``; re-plans it if it is its turn."""
-        if not self.enabled:
+        """Called on every sample ``[B * T]`` or ``[B, T]``; re-plans it if it is its turn.
+
+        Rows that are read as ``buffer[...]`` come here too and count as a sample, except for a single one.
+        """
+        if not self.enabled or not tensordict.batch_dims:
             return tensordict
         self.samples += 1
         if self.samples % self.interval:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, RoundRobinWriter, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage, TensorStorage
 
@@ -57,14 +58,16 @@ class StepSliceSampler(Sampler):
             ``"episodes"``.
         partial (bool): whether a slice may also begin in the last T - 1 steps of an episode that has ended (so that
             an ended episode shorter than T is sampled too). Beyond the end such a slice repeats the last step, and a
-            sample has ``mask_key``, false there. Shapes stay as they are. Default: ``False``.
+            sample of a ``TensorDictReplayBuffer`` has ``mask_key``, false there. Shapes stay as they are. Default:
+            ``False``.
         as_slices (bool): whether a sample has the batch size ``[batch_size / T, T]``, as the losses take it, instead of
             ``[batch_size]``. Default: ``False``.
 
     Raises:
         ValueError: if an argument is out of range, a batch size is not a multiple of ``slice_len``, or the rows of the
             buffer are batches.
-        TypeError: if the storage is not a flat tensor storage.
+        TypeError: if the storage is not a flat tensor storage, the buffer's writer does not write round the ring, or,
+            with ``partial``, the buffer does not add the mask to its samples.
         KeyError: if the rows lack ``traj_key`` or, with ``partial``, ``done_key``.
         RuntimeError: if there is no complete slice yet, or the sampler missed writes.
 
@@ -111,6 +114,7 @@ class StepSliceSampler(Sampler):
         self._followed = 0  # rows that are in the table
         self._trajectories = Trajectories()
         self._starts: tuple[np.ndarray, np.ndarray] | None = None  # of the rows that were followed
+        self._checked: Storage | None = None  # whose buffer can hold and pass on what this sampler needs
 
     def add(self, index: int) -> None:
         """Is called by the replay buffer after one row was written."""
@@ -186,6 +190,9 @@ class StepSliceSampler(Sampler):
                 f"{type(storage).__name__}(ndim={storage.ndim}); use LazyTensorStorage(capacity) or "
                 "LazyMemmapStorage(capacity) and write flat rows."
             )
+        if self._checked is not storage:
+            self._check_buffer(storage)
+            self._checked = storage
         self._check_written(storage)
         oldest = max(self._written - storage.max_size, 0)
         if self._starts is None or self._followed < self._written:
@@ -202,13 +209,38 @@ class StepSliceSampler(Sampler):
             self._starts = first, np.maximum(counts - beyond, 0)
         return self._starts
 
+    def _buffer(self, storage: Storage) -> ReplayBuffer | None:
+        """The buffer that samples from the storage by this sampler, where it is known."""
+        attached = (entity for entity in storage._attached_entities if isinstance(entity, ReplayBuffer))
+        return next((buffer for buffer in attached if buffer.sampler is self), None)
+
+    def _check_buffer(self, storage: Storage) -> None:
+        buffer = self._buffer(storage)
+        if buffer is None:
+            return
+        if not isinstance(buffer.writer, (RoundRobinWriter, ImmutableDatasetWriter)):
+            raise TypeError(
+                "StepSliceSampler needs rows in the order of their writing, which "
+                f"{type(buffer.writer).__name__} does not keep; build the buffer with "
+                "writer=TensorDictRoundRobinWriter()."
+            )
+        if self.partial and not isinstance(buffer, TensorDictReplayBuffer):
+            raise TypeError(
+                f"partial=True needs the mask {self.mask_key!r} in every sample, which {type(buffer).__name__} leaves "
+                "out; use TensorDictReplayBuffer."
+            )
+
     def _check_written(self, storage: TensorStorage) -> None:
         """Compares what was seen with what is stored; a buffer that was filled before is read from its oldest row."""
         capacity, stored = storage.max_size, len(storage)
         if self._newest is None:
             self._newest = self._written - 1
         newest = self._newest = int(self._newest)  # waits once per write
-        if stored == min(self._written, capacity) and not (newest + 1 - self._written) % capacity:
+        # In a full ring the number of rows no longer tells of foreign writes, but the storage's cursor does. It is not
+        # known of a storage that was loaded.
+        cursor = storage._last_cursor_index if self._written >= capacity else None
+        missed = cursor is not None and int(cursor) != newest % capacity
+        if stored == min(self._written, capacity) and not (newest + 1 - self._written) % capacity and not missed:
             return
         if self._followed:
             raise RuntimeError(
@@ -220,6 +252,9 @@ class StepSliceSampler(Sampler):
             newest = stored - 1
         elif newest < 0:
             newest = storage._last_cursor_index  # as TorchRL's samplers do
+            buffer = self._buffer(storage)
+            if newest is None and buffer is not None and isinstance(buffer.writer, ImmutableDatasetWriter):
+                newest = capacity - 1  # a data set begins with its first row
             if newest is None:
                 raise RuntimeError(
                     f"the buffer was full ({capacity} rows) before the sampler saw it, and which row is the oldest is "
@@ -293,8 +328,12 @@ class StepSliceSampler(Sampler):
         torch.save(self.state_dict(), path / "slices.pt")
 
     def loads(self, path: str | Path) -> None:
-        """Reads what :meth:`dumps` wrote."""
-        self.load_state_dict(torch.load(Path(path) / "slices.pt", weights_only=True))
+        """Reads what :meth:`dumps` wrote; of a buffer that another sampler dumped, the rows are read anew."""
+        file = Path(path) / "slices.pt"
+        if file.exists():
+            self.load_state_dict(torch.load(file, weights_only=True))
+        else:
+            self._empty()
 
     def __repr__(self) -> str:
         partial = ", partial=True" if self.partial else ""
