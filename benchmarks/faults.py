@@ -238,7 +238,13 @@ def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
     def restored(**changes: Any) -> Any:
         run.config = run.checkpoints.config = plan_launch(dataclasses.replace(config, **changes), changes).config
         run.learner.replay.empty()
-        run.checkpoints.restore()
+        directory = RunDirectory(run_dir)
+        directory.go_on()
+        try:
+            run.checkpoints.restore()
+            directory.write_config(run.config.to_dict())
+        finally:
+            directory.close()
         return run.config.to_dict(), state(run)
 
     expected = [restored()]

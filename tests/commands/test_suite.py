@@ -11,6 +11,7 @@ import yaml
 
 from torchrl_etdmpc import commands
 from torchrl_etdmpc.commands import suite
+from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.suites import RunQueue, read_experiment
 
 SMALL = {"preset": "cpu", "device": "cpu", "task.episode_length": 200, "replay.seed_decisions": 40}
@@ -222,6 +223,20 @@ def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
             ["stauts", "experiment=cpu-easy"],
             "unknown word 'stauts'; a setting is written name=value, --help lists them.",
         ),
+        (
+            ["experiment=cpu-easy", "task=walker-walk"],
+            "task is not for a suite, which gives it to each run; write tasks=",
+        ),
+        (["experiment=cpu-easy", "seed=7"], "seed is not for a suite, which gives it to each run; write seeds=3 for "),
+        (
+            ["experiment=cpu-easy", "run_dir=a"],
+            "run_dir is not for a suite, which gives it to each run; write runs_dir",
+        ),
+        (
+            ["experiment=cpu-easy", "resume=true"],
+            "resume is not for a suite, which gives it to each run; leave it out,",
+        ),
+        (["experiment=cpu-easy", "taks=a"], "unknown setting taks; did you mean tasks? --help lists all."),
         (["experiment=cpu-easy", "worker=3"], "unknown setting worker; did you mean workers? --help lists all."),
         (
             ["experiment=cpu-easy", "planner.horizont=3"],
@@ -282,6 +297,21 @@ def test_an_experiment_that_was_changed_is_never_mixed_with_what_it_was(call, mi
     )
     assert (tmp_path / "here" / "experiment.yaml").read_bytes() == before
     assert len(trained) == 1
+
+
+def test_the_directory_of_a_run_is_no_folder_for_many(call, mine, tmp_path):
+    directory = RunDirectory(tmp_path / "here")
+    directory.begin({"task": "walker-walk", "preset": "cpu", "seed": 1})
+    before = sorted(path.name for path in directory.path.iterdir())
+    code, _ = call(f"experiment={mine()}", "runs_dir=here")
+    assert code == f"error: runs_dir={directory.path} is the directory of a run; choose a folder for many of them."
+    assert sorted(path.name for path in directory.path.iterdir()) == before
+    directory.close()
+
+
+def test_a_file_says_its_budget_once(call, mine):
+    code, _ = call(f"experiment={mine(settings={**SMALL, 'total_env_steps': 700})}", "runs_dir=here")
+    assert "says budget and, in its settings, total_env_steps, which are the same; leave one out." in code
 
 
 def test_a_folder_that_cannot_be_written_is_named(call, mine, tmp_path):

@@ -105,7 +105,8 @@ def test_a_path_to_code_is_not_followed(tmp_path, monkeypatch):
     with pytest.raises(ValueError) as error:
         get_task("has_side_effect:make")
     assert str(error.value) == (
-        "task 'has_side_effect:make' names code, which must be given on the command line: task=has_side_effect:make"
+        "task 'has_side_effect:make' names code, which must be given on the command line: task=has_side_effect:make, "
+        "or code=has_side_effect:make of a suite"
     )
     for name in ("gym/has_side_effect:Pendulum-v1", "has_side_effect"):  # gymnasium.make would import the module
         with pytest.raises(ValueError, match=r"^unknown task"):

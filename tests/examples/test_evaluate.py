@@ -107,7 +107,7 @@ def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_m
         f"checkpoint={checkpoint}", "task=cartpole-swingup", "episodes=1", "policy=bare", "device=cpu"
     )
     assert (message, err) == (None, "")
-    assert out.startswith("cartpole-swingup (bare, trained for 400 env steps): return ")
+    assert out.startswith("cartpole-swingup (bare, trained on cartpole-balance for 400 env steps): return ")
 
 
 def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, run_main, save_untrained):

@@ -239,7 +239,7 @@ def test_a_benchmark_of_none_of_the_runs_is_refused(refused):
 @pytest.mark.parametrize("text", ["", HEADER, HEADER.strip()])
 def test_runs_that_have_not_evaluated_yet_are_refused(refused, text):
     make_run("runs/a", text=text)
-    assert refused("runs").startswith("no evaluation in any of the runs yet")
+    assert refused("runs").startswith("no evaluation after 0 env steps in any of the runs yet")
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
         (("--budget", "-1"), "--budget must be positive, got -1."),
         (("--watch", "0"), "--watch must be positive, got 0."),
         (("--grid-step", "300000"), "the grid needs at least two steps"),
-        (("--budget", "150000"), "the budget must be a multiple of the grid step"),
+        (("--budget", "250000"), "the budget must be a multiple of the grid step"),
     ],
 )
 def test_an_option_that_makes_no_sense_is_refused(refused, arguments, message):
@@ -400,11 +400,39 @@ def test_a_short_run_has_a_report_without_dashes(run_main, capfd):
     )
 
 
-def test_a_run_that_has_only_begun_is_named(refused):
+def test_a_run_that_has_only_begun_is_left_out_and_named(run_main, refused, capfd):
     make_run("runs/a", text=HEADER + "0,0,7,1.0,3,0.5,10\n")
-    assert refused("runs") == (
-        "cpu on walker-walk with seed 1 has only its first evaluation yet, at 0 env steps; wait, or leave that run out."
+    assert refused("runs") == "no evaluation after 0 env steps in any of the runs yet; wait for the first one."
+    make_run("runs/b", seed=2)
+    run_main("runs")
+    out, err = capfd.readouterr()
+    assert out == (
+        "1 run on 1 task of Easy DMC, up to 100,000 env steps, compared at 100,000, which all of them reach (the "
+        "benchmark's budget is 200,000); 1 missing or unfinished (cpu on walker-walk with seed 1: ends at 0 env steps, "
+        "others at 100,000); the report is report/index.md\n"
     )
+    assert err == ""
+
+
+def test_runs_on_a_task_of_no_benchmark_say_where_they_are_compared(run_main, capfd):
+    rows = [f"{steps},{steps},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 10_001, 2_000)]
+    make_run("runs/a", task="gym/Pendulum-v1", text=HEADER + "".join(rows))
+    make_run("runs/b", task="gym/Pendulum-v1", seed=2, text=HEADER + "".join(rows[:2]))
+    run_main("runs")
+    assert "up to 10,000 env steps, compared at 2,000, which all of them reach; 1 missing" in capfd.readouterr().out
+
+
+def test_a_small_budget_needs_no_step_of_the_grid(run_main, capfd):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 25_001, 5_000))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs", "--budget", "20000")
+    assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 200
+
+
+def test_a_file_in_the_place_of_the_report_is_named(refused):
+    make_run("runs/a")
+    Path("notes.txt").write_text("mine")
+    assert refused("runs", "--out", "notes.txt") == "--out=notes.txt is a file; name a folder."
 
 
 def test_one_broken_run_is_skipped_and_named(run_main, capfd):

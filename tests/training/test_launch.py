@@ -99,7 +99,8 @@ def test_tables_without_a_configuration_are_not_written_over_either(command, res
     path = getattr(RunDirectory(command().run_dir), file)
     path.parent.mkdir(parents=True)
     path.write_text("1\n")
-    with pytest.raises(FileExistsError, match="already holds a run"):
+    error = (FileExistsError, "already holds a run") if resume == "off" else (FileNotFoundError, "settings are lost")
+    with pytest.raises(error[0], match=error[1]):
         plan(command(resume=resume))
 
 
@@ -330,12 +331,38 @@ def test_a_damaged_configuration_is_taken_from_the_weights(command, tiny_config,
         os.mkfifo(directory.config)
     elif how != "missing":
         directory.config.write_text(text.replace("horizon: 2", "horizon: 3") if how == "changed" else text[:-20])
-    with pytest.warns(UserWarning, match=r"config.*; the settings are those of .*last\.pt\.$"):
+    with pytest.warns(UserWarning, match=r"config\.yaml is .*; the settings are those of .*last\.pt\.$"):
         assert plan(command(resume="on")) == ("resume", command())
     directory.last_agent.unlink()
+    lost = "missing" if how == "missing" else "damaged"
+    errors = {
+        "missing": (
+            FileNotFoundError,
+            r"holds a run whose settings are lost: config\.yaml and checkpoints/last\.pt are gone",
+        ),
+        "damaged": (ValueError, r"config\.yaml is not a configuration: "),
+    }
+    for resume in ("on", "auto"):
+        with pytest.raises(errors[lost][0], match=errors[lost][1]):
+            plan(command(resume=resume))
+
+
+@needs_dm_control
+@pytest.mark.parametrize("how", ["changed", "missing", "no text"])
+def test_a_run_with_a_damaged_configuration_goes_on_and_has_it_back(command, process, read_table, how):
+    launch(command(total_env_steps=100))
+    directory = RunDirectory(command().run_dir)
+    text = directory.config.read_text()
+    damaged = {"changed": text.replace("horizon: 2", "horizon: 3").encode(), "no text": b"\xff" + text.encode()}
+    directory.config.unlink()
     if how != "missing":
-        with pytest.raises(ValueError, match=r"config\.yaml is not a configuration: "):
-            plan(command(resume="auto"))
+        directory.config.write_bytes(damaged[how])
+    asked = command(total_env_steps=140, resume="auto")
+    with pytest.warns(UserWarning, match=r"config\.yaml is .*; the settings are those of .*last\.pt\.$"):
+        launch(asked, ["total_env_steps"])
+    assert directory.finished
+    assert [row["env_steps"] for row in read_table(directory.eval)] == [0, 100, 140]
+    assert directory.read_config() == asked.to_dict() | {"resume": "off"}
 
 
 class Killed(BaseException):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -68,7 +67,7 @@ def main(config: EvaluateConfig) -> None:
     task = config.task_spec
     # A film needs the one environment that it shows; otherwise the episodes run side by side.
     env = make_env(task, seed=config.seed, num_envs=1 if config.video else config.episodes, parallel=False)
-    agent, _, counters = load_agent(
+    agent, trained, counters = load_agent(
         config.checkpoint,
         observation_dim=env.observation_spec["observation"].shape[-1],
         action_dim=env.action_spec.shape[-1],
@@ -106,7 +105,8 @@ def main(config: EvaluateConfig) -> None:
         write_whole(Path(config.csv), _table(task, played))
     env.close(raise_if_closed=False)
     files = [f"; {what} in {file}" for what, file in (("film", config.video), ("episodes", config.csv)) if file]
-    print(_outcome(config, task, played, counters) + "".join(files))
+    elsewhere = "" if task.name == trained.task else f"on {trained.task} "
+    print(_outcome(config, task, played, f"{elsewhere}for {counters['env_steps']}") + "".join(files))
 
 
 def _make_folder(file: Path) -> None:
@@ -128,12 +128,12 @@ def _table(task: Task, played: Episodes) -> str:
     return "\n".join([*rows, ""])
 
 
-def _outcome(config: EvaluateConfig, task: Task, played: Episodes, counters: Mapping[str, int | float]) -> str:
+def _outcome(config: EvaluateConfig, task: Task, played: Episodes, trained: str) -> str:
     returns, least = played.returns, success_return(task)
     settings = ", ".join(f"{name}={value}" for name, value in config.changed.items())
     who = f"{config.policy} with {settings}" if settings else config.policy
     said = (
-        f"{task.name} ({who}, trained for {counters['env_steps']} env steps): return {returns.mean():.1f} "
+        f"{task.name} ({who}, trained {trained} env steps): return {returns.mean():.1f} "
         f"+- {returns.std(correction=0):.1f} over {len(returns)} episodes"
     )
     if task.terminates:

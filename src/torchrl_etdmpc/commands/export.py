@@ -32,6 +32,9 @@ class ExportConfig(AgentCommandConfig):
 @hydra_main(CONFIG, "export", ExportConfig)
 def main(config: ExportConfig) -> None:
     """Writes an agent's policy and planner as programs that run where only PyTorch is installed."""
+    out = Path(config.out).expanduser()
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"out={config.out} is a file; name a folder.")
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
     if config.task not in (None, run.task):
         raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
@@ -49,7 +52,6 @@ def main(config: ExportConfig) -> None:
             torch.manual_seed(0)
             actions.append(plan(observation, plan_mean)[0])
         torch.testing.assert_close(*actions)
-    out = Path(config.out).expanduser()
     out.mkdir(parents=True, exist_ok=True)
     for name, program in (("policy", policy), ("planner", planner)):
         with replacing(out / f"{name}.pt2") as partial:

@@ -74,6 +74,8 @@ def parse() -> argparse.Namespace:
         arguments.points = [] if theirs else [REFERENCE / "points.csv"]
     if arguments.benchmark is not None:
         get_benchmark(arguments.benchmark)  # a wrong name ends here, also when watching
+    if Path(arguments.out).expanduser().is_file():
+        raise ValueError(f"--out={arguments.out} is a file; name a folder.")
     for name in ("budget", "grid_step", "grid_start", "watch"):
         value = getattr(arguments, name)
         if value is not None and value <= 0:
@@ -125,11 +127,7 @@ def read(arguments: argparse.Namespace) -> tuple[list[Run], Table, list[Experime
 def choose_budget(
     arguments: argparse.Namespace, benchmark: Benchmark, runs: Table, experiments: list[Experiment]
 ) -> tuple[int, int]:
-    """The budget and the step of the AUC's grid: those asked for or planned, the benchmark's, or what all runs reach.
-
-    Raises:
-        ValueError: if a run has not got beyond its first evaluation.
-    """
+    """The budget and the step of the AUC's grid: what was asked for or planned, the benchmark's, or what all reach."""
     from torchrl_etdmpc.analysis import BENCHMARKS, begins
 
     last = runs.groupby(["method", "task", "seed"])["env_steps"].max()
@@ -138,17 +136,12 @@ def choose_budget(
     planned = {budget for budget in planned if budget and budget <= last.max()}
     step = None
     if arguments.budget or (reached >= benchmark.budget and benchmark.name in BENCHMARKS):
-        budget, step = arguments.budget or benchmark.budget, DEFAULT_GRID_STEP
+        budget = arguments.budget or benchmark.budget
+        step = DEFAULT_GRID_STEP if budget >= 2 * DEFAULT_GRID_STEP else None
     elif len(planned) == 1:  # a run that ended early is named, and does not shorten the others
         (budget,) = planned
-    elif reached:
-        budget = min(reached, benchmark.budget)
     else:
-        method, task, seed = last.idxmin()
-        raise ValueError(
-            f"{method} on {task} with seed {seed} has only its first evaluation yet, at 0 env steps; wait, or leave "
-            "that run out."
-        )
+        budget = min(reached, benchmark.budget)
     if step is None:
         first = begins(runs).max()
         steps = [budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0]
@@ -181,13 +174,23 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     """Writes the report; returns a line for the terminal."""
     import pandas as pd
 
-    from torchrl_etdmpc.analysis import compare, evaluated_methods, incomplete_runs, join_curves, write_report
+    from torchrl_etdmpc.analysis import (
+        BENCHMARKS,
+        compare,
+        evaluated_methods,
+        incomplete_runs,
+        join_curves,
+        write_report,
+    )
 
     found, runs, experiments, lines = read(arguments)
     for line in lines:
         print(line, file=sys.stderr, flush=True)
+    # A run that has just begun would make nothing of the comparison; it is named as unfinished.
+    last = runs.groupby(["method", "task", "seed"])["env_steps"].transform("max")
+    runs = runs[last > 0]
     if runs.empty:
-        raise ValueError("no evaluation in any of the runs yet; wait for the first one.")
+        raise ValueError("no evaluation after 0 env steps in any of the runs yet; wait for the first one.")
     present = list(dict.fromkeys(runs["task"]))
     benchmark = choose_benchmark(arguments, runs)
     tasks = tuple(task for task in benchmark.tasks if arguments.all_tasks or task in present)
@@ -224,9 +227,10 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     last = chosen["env_steps"].max()
     counts = f"{count} run{'s' * (count > 1)} on {len(tasks)} task{'s' * (len(tasks) > 1)} of {benchmark.title}"
     at = ""
-    if not arguments.budget and budget != benchmark.budget:
+    if not arguments.budget and (budget != benchmark.budget or budget < last):
         which = "which all of them reach" if budget <= reached(chosen) else "the budget of the experiment"
-        at = f", compared at {budget:,}, {which} (the benchmark's budget is {benchmark.budget:,})"
+        known = f" (the benchmark's budget is {benchmark.budget:,})" if benchmark.name in BENCHMARKS else ""
+        at = f", compared at {budget:,}, {which}{known}"
     at += missing(incomplete)
     return f"{counts}, up to {last:,.0f} env steps{at}; the report is {page}"
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from torchrl_etdmpc.commands.command_line import nearest, one_line_errors
 from torchrl_etdmpc.commands.settings_help import help_text, settings_of
 from torchrl_etdmpc.envs import import_task
-from torchrl_etdmpc.runs import console
+from torchrl_etdmpc.runs import RunDirectory, console
 from torchrl_etdmpc.suites import (
     Experiment,
     Run,
@@ -48,7 +48,16 @@ WHAT = """Trains every run of an experiment: tasks x seeds x variants.
   suite list                          the experiments by name
   suite experiment=NAME preset=cpu tasks=walker-walk,cup-catch seeds=2 total_env_steps=50000
 
-Any setting of train does as well, for all variants."""
+Any setting of train does as well, for all variants, but for those of one run: task, seed, run_dir and resume."""
+
+
+INSTEAD = {
+    "task": "write tasks=walker-walk,cup-catch",
+    "seed": "write seeds=3 for three of them, or seeds=[7] for this one",
+    "run_dir": "write runs_dir=FOLDER",
+    "resume": "leave it out, every run goes on from where it is",
+}
+"""Settings of train that a command line of a suite must not hold, and what to write."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +119,8 @@ def main() -> None:
     config, settings = _read(sys.argv[1:])
     asked = _experiment(config, settings)
     folder = Path(config.runs_dir or f"runs/{asked.name}").expanduser().absolute()
+    if RunDirectory(folder).holds_a_run:
+        raise ValueError(f"runs_dir={folder} is the directory of a run; choose a folder for many of them.")
     file = folder / "experiment.yaml"
     stored = read_experiment(file) if file.exists() else None
     _import_own_code(config, settings, [asked] if stored is None else [asked, stored])
@@ -211,7 +222,8 @@ def _import_own_code(config: SuiteConfig, settings: dict[str, Any], experiments:
 
 def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
     """The suite's own settings, and those of training."""
-    own, training = settings_of(SuiteConfig), settings_of(TrainConfig)
+    own = settings_of(SuiteConfig)
+    training = {name: setting for name, setting in settings_of(TrainConfig).items() if name not in INSTEAD}
     values, settings = {}, {}
     for argument in arguments:
         name, equals, text = argument.partition("=")
@@ -222,6 +234,8 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
             values[name] = text if own[name].is_text or own[name].choices else _value(text)
         elif name in training:
             settings[name] = text if training[name].is_text else _value(text)
+        elif name in INSTEAD:
+            raise ValueError(f"{name} is not for a suite, which gives it to each run; {INSTEAD[name]}.")
         else:
             raise ValueError(f"unknown setting {name}; {nearest(name, [*own, *training])}")
     if not values.get("experiment") and values.get("runs_dir"):

@@ -227,7 +227,9 @@ def get_task(
         return _gymnasium_task(name, told)
     if ":" in str(name):
         # A stored run or checkpoint may hold such a name, and no file may make us import code.
-        raise ValueError(f"task {name!r} names code, which must be given on the command line: task={name}")
+        raise ValueError(
+            f"task {name!r} names code, which must be given on the command line: task={name}, or code={name} of a suite"
+        )
     robot, _, goal = str(name).partition("-")
     if robot in _HUMANOID_ROBOTS and goal in _HUMANOID_GOALS:
         length = 500 if goal in _HUMANOID_SHORT else 1000

@@ -173,13 +173,14 @@ class RunDirectory:
             raise
 
     def go_on(self) -> None:
-        """Locks the directory of a run that goes on.
+        """Locks the directory of a run that goes on; a damaged configuration is for :meth:`write_config` to replace.
 
         Raises:
             FileNotFoundError: if it holds no run.
             OSError: if it cannot be written, or is in use by another process.
         """
-        self.read_config()
+        if not self.holds_a_run:
+            raise FileNotFoundError(f"run_dir={self} holds no run to go on with; start it with resume=off.")
         self._lock()
 
     def write_config(self, config: Mapping[str, Any]) -> None:
@@ -190,7 +191,7 @@ class RunDirectory:
             OSError: if it cannot be written; the directory is closed.
         """
         text = _to_yaml(config)
-        if not self.config.is_file() or text != self.config.read_text(encoding="utf-8"):
+        if not self.config.is_file() or text.encode() != self.config.read_bytes():
             self._write_config(text)
 
     def abandon(self) -> None:

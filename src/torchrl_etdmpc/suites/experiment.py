@@ -276,6 +276,11 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
     known = {"tasks", "seeds", "variants", "settings", "budget", "base", "title", "source"}
     unknown = sorted(map(str, set(values) - known))
     _require(not unknown, f"{file} has an unknown entry {', '.join(unknown[:1])}; known: {', '.join(sorted(known))}.")
+    shared = _settings(values.get("settings"), f"settings of {file}")
+    _require(
+        not {"budget"} <= set(values) or "total_env_steps" not in shared,
+        f"{file} says budget and, in its settings, total_env_steps, which are the same; leave one out.",
+    )
     more = dict(changes.get("settings") or {})
     budget: Any = more.pop("total_env_steps", values.get("budget", "benchmark"))
     budget = int(budget) if isinstance(budget, float) and budget.is_integer() else budget
@@ -290,7 +295,7 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
         seeds=_seeds(changes.get("seeds") or values.get("seeds"), file),
         variants=variants,
         searches=searches,
-        settings=_settings(values.get("settings"), f"settings of {file}") | more,
+        settings=shared | more,
         budget=budget,
         base=None if values.get("base") is None else str(values["base"]),
         title=str(values.get("title", "")),

@@ -83,7 +83,7 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
     'begin'
     """
     directory = _directory(config.to_dict())
-    there = directory.config.exists() or directory.last_agent.exists()
+    there = _says_its_settings(directory, config.resume)
     if directory.leftover or config.resume == "off" or (config.resume == "auto" and not there):
         directory.require_new()
         return Launch(config, directory, "begin")
@@ -211,7 +211,10 @@ def read_run_config(directory: RunDirectory, kind: type[TrainConfig] = TrainConf
             values = read_agent_file(directory.last_agent)["config"]
         except CheckpointError:
             raise error from None
-        warnings.warn(f"{str(error).rstrip('.')}; the settings are those of {directory.last_agent}.", stacklevel=2)
+        lost = isinstance(error, FileNotFoundError)
+        why = f"{directory.config} is missing" if lost else str(error).rstrip(".")
+        # Commands read it more than once; from one place the warning is shown once.
+        warnings.warn(f"{why}; the settings are those of {directory.last_agent}.", stacklevel=1)
     else:
         by_workers = is_distributed(values)
         if isinstance(values, Mapping) and by_workers != issubclass(kind, DistributedConfig):
@@ -245,10 +248,21 @@ def with_stored_settings(
     'cpu'
     """
     directory, resume = _directory(values), values.get("resume", "off")
-    there = directory.config.exists() or directory.last_agent.exists()
-    if resume in (False, "off", "false") or directory.leftover or not there:
+    resume = {True: "true", False: "off", "false": "off"}.get(resume, resume)
+    if not _says_its_settings(directory, resume) or resume == "off" or directory.leftover:
         return dict(values)
     return resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
+
+
+def _says_its_settings(directory: RunDirectory, resume: str) -> bool:
+    """Whether a run is there whose settings can be read; one that goes on without them would be another run."""
+    there = directory.config.exists() or directory.last_agent.exists()
+    if directory.holds_a_run and resume != "off" and not there:
+        raise FileNotFoundError(
+            f"run_dir={directory} holds a run whose settings are lost: config.yaml and checkpoints/last.pt are gone. "
+            "Put one of them back, choose another run_dir, or remove this one."
+        )
+    return there
 
 
 def _directory(values: Mapping[str, Any]) -> RunDirectory:
