@@ -132,3 +132,12 @@ def test_a_compiled_planner_takes_batches_of_several_sizes():
 def test_the_repr_says_how_the_planner_plans():
     assert "horizon=2, num_samples=8, num_elites=2" in repr(make_planner())
     assert "score=" in repr(make_planner())
+
+
+def test_a_generator_draws_for_the_entries_whatever_the_batch_size_says():
+    planner, data = make_planner(), states()
+    drawn = [
+        planner(TensorDict(data.to_dict(), batch_size=size), generator=torch.Generator().manual_seed(4))["action"]
+        for size in ([], data.batch_size)
+    ]
+    assert torch.equal(*drawn)

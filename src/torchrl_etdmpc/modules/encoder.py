@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchrl_etdmpc.functional import simnorm
-from torchrl_etdmpc.modules.normed_linear import MLP, Activation
+from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
 
 
-class Encoder(MLP):
+class Encoder(LayerStack):
     """Observation to latent, ``z = h(s)`` (thesis Table 3.1): hidden layers, then Linear, LayerNorm, SimNorm.
 
     Args:

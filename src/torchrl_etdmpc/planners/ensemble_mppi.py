@@ -335,9 +335,11 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         make_plan = self.plan if self.compiled_plan is None else self.compiled_plan
         drawn: dict[str, Any] = {}
         if generator is not None:
-            states = observation if latent is None else latent
-            vectors = latent is not None or self.world_model.observation_dim is not None
-            batch = states.shape[:-1] if vectors else tensordict.batch_size  # which may be shorter than the entries'
+            batch = tensordict.batch_size  # which may be shorter than that of the entries
+            if latent is not None:
+                batch = latent.shape[:-1]
+            elif observation is not None and self.world_model.observation_dim is not None:
+                batch = observation.shape[:-1]
             drawn["noise"] = self.draw_noise(*batch, generator=generator)
         plan = make_plan(observation, carried, latent=latent, explore=explore, **drawn)
         outputs = {

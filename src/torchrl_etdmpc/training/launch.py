@@ -248,7 +248,7 @@ def with_stored_settings(
     'cpu'
     """
     directory, resume = _directory(values), values.get("resume", "off")
-    resume = {True: "true", False: "off", "false": "off"}.get(resume, resume)
+    resume = "off" if resume in (False, "false") else str(resume)
     if not _says_its_settings(directory, resume) or resume == "off" or directory.leftover:
         return dict(values)
     return resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
