@@ -258,8 +258,9 @@ def _says_its_settings(directory: RunDirectory, resume: str) -> bool:
     """Whether a run is there whose settings can be read; one that goes on without them would be another run."""
     there = directory.config.exists() or directory.last_agent.exists()
     if directory.holds_a_run and resume != "off" and not there:
+        weights = directory.last_agent.relative_to(directory.path)
         raise FileNotFoundError(
-            f"run_dir={directory} holds a run whose settings are lost: config.yaml and checkpoints/last.pt are gone. "
+            f"run_dir={directory} holds a run whose settings are lost: {directory.config.name} and {weights} are gone. "
             "Put one of them back, choose another run_dir, or remove this one."
         )
     return there
