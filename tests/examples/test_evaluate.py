@@ -71,17 +71,19 @@ def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint,
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_episode_has_its_line_in_a_table(tmp_path, checkpoint, run_main):
+def test_every_episode_has_its_line_in_a_table(tmp_path, monkeypatch, checkpoint, run_main):
+    monkeypatch.setenv("HOME", str(tmp_path))
     message, out, err = run_main(
-        f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "seed=5", "device=cpu", "csv=a.csv"
+        f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "seed=5", "device=cpu", "csv=~/tables/a.csv"
     )
     assert (message, err) == (None, "")
-    assert out.endswith(" over 3 episodes; episodes in a.csv\n")
+    assert out.endswith(" over 3 episodes; episodes in ~/tables/a.csv\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["tables"]
     agent, _, _ = load_agent(checkpoint)
     env = make_env("cartpole-balance", seed=5, num_envs=3, parallel=False)
     played = evaluate(env, BarePolicy(agent.world_model), episodes=3)
     assert len(set(played.returns.tolist())) == 3
-    table = pd.read_csv(tmp_path / "a.csv")
+    table = pd.read_csv(tmp_path / "tables" / "a.csv")
     assert list(table.columns) == ["episode", "return", "decisions"]
     assert table["episode"].tolist() == [0, 1, 2]
     assert table["return"].tolist() == played.returns.tolist()

@@ -18,6 +18,7 @@ from torchrl.data import (
     ListStorage,
     RandomSampler,
     ReplayBuffer,
+    Storage,
     TensorDictMaxValueWriter,
     TensorDictReplayBuffer,
     TensorDictRoundRobinWriter,
@@ -402,6 +403,13 @@ def test_a_snapshot_does_not_change_with_the_sampler():
     ring.draw(1)
     assert (snapshot["written"], snapshot["open"]) == (before[0], before[2])
     assert torch.equal(snapshot["segments"], before[1])
+
+
+def test_a_sampler_keeps_no_storage_alive():
+    ring = Ring(20, 3)
+    ring.write(contiguous([5], 12))
+    ring.draw(1)
+    assert not any(isinstance(value, Storage) for value in vars(ring.sampler).values())
 
 
 def test_draws_are_reproducible_by_torch_manual_seed():

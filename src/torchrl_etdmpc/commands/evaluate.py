@@ -62,7 +62,7 @@ def main(config: EvaluateConfig) -> None:
         raise ValueError(f"planner.{name} changes nothing with policy=bare, which does not plan; leave one out.")
     for file in (config.video, config.csv):
         if file is not None:
-            _make_folder(Path(file))
+            _make_folder(Path(file).expanduser())
     device = resolve_device(config.device)
     task = config.task_spec
     # A film needs the one environment that it shows; otherwise the episodes run side by side.
@@ -102,7 +102,7 @@ def main(config: EvaluateConfig) -> None:
     if config.video:
         write_film(frames, config.video, fps=FRAMES_PER_SECOND)
     if config.csv:
-        write_whole(Path(config.csv), _table(task, played))
+        write_whole(Path(config.csv).expanduser(), _table(task, played))
     env.close(raise_if_closed=False)
     files = [f"; {what} in {file}" for what, file in (("film", config.video), ("episodes", config.csv)) if file]
     elsewhere = "" if task.name == trained.task else f"on {trained.task} "

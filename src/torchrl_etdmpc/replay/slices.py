@@ -114,7 +114,7 @@ class StepSliceSampler(Sampler):
         self._followed = 0  # rows that are in the table
         self._trajectories = Trajectories()
         self._starts: tuple[np.ndarray, np.ndarray] | None = None  # of the rows that were followed
-        self._checked: Storage | None = None  # whose buffer can hold and pass on what this sampler needs
+        self._checked: int | None = None  # id of the storage whose buffer can hold and pass on what this sampler needs
 
     def add(self, index: int) -> None:
         """Is called by the replay buffer after one row was written."""
@@ -190,9 +190,9 @@ class StepSliceSampler(Sampler):
                 f"{type(storage).__name__}(ndim={storage.ndim}); use LazyTensorStorage(capacity) or "
                 "LazyMemmapStorage(capacity) and write flat rows."
             )
-        if self._checked is not storage:
+        if self._checked != id(storage):
             self._check_buffer(storage)
-            self._checked = storage
+            self._checked = id(storage)
         self._check_written(storage)
         oldest = max(self._written - storage.max_size, 0)
         if self._starts is None or self._followed < self._written:
