@@ -34,6 +34,7 @@ from torchrl_etdmpc import (
     export_planner,
 )
 from torchrl_etdmpc.functional import simnorm
+from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
 
 
@@ -240,3 +241,14 @@ def test_a_world_model_without_a_size_needs_an_encoder():
 def test_an_encoder_of_images_is_short():
     lines = [line for line in inspect.getsource(PixelEncoder).splitlines() if line.strip()]
     assert len(lines) + 1 <= 15  # and the line that passes it
+
+
+def test_an_encoder_with_nothing_to_learn_trains_the_rest():
+    model = WorldModel(None, 2, encoder=nn.Softmax(-1), latent_dim=8, mlp_dim=16, simnorm_dim=8)
+    loss = EfficientTDMPCLoss(model, discount=0.9)
+    SoftUpdate(loss, tau=0.1)
+    rows = random_slices(8, 2)
+    terms = loss(rows)
+    sum(terms[key] for key in terms.keys() if key.startswith("loss_")).backward()
+    assert model.policy.output.weight.grad.isfinite().all()
+    assert model.policy.output.weight.grad.any()
