@@ -278,7 +278,7 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
     _require(not unknown, f"{file} has an unknown entry {', '.join(unknown[:1])}; known: {', '.join(sorted(known))}.")
     shared = _settings(values.get("settings"), f"settings of {file}")
     _require(
-        not {"budget"} <= set(values) or "total_env_steps" not in shared,
+        "budget" not in values or "total_env_steps" not in shared,
         f"{file} says budget and, in its settings, total_env_steps, which are the same; leave one out.",
     )
     more = dict(changes.get("settings") or {})
