@@ -10,7 +10,7 @@ import time
 import pytest
 import torch
 
-from torchrl_etdmpc.suites import RunQueue, local, read_progress, run_locally, run_queue
+from torchrl_etdmpc.suites import Run, RunQueue, local, read_progress, run_locally, run_queue
 from torchrl_etdmpc.suites.local import visible_gpus
 
 
@@ -18,6 +18,12 @@ from torchrl_etdmpc.suites.local import visible_gpus
 def quick(monkeypatch):
     monkeypatch.setattr(local, "_POLL_S", 0.01)
     monkeypatch.setattr(run_queue, "_LOOK_AGAIN_S", 0.05)
+
+
+def wait_until_at_work(runs: list[Run], count: int) -> None:
+    deadline = time.monotonic() + 30
+    while sum((run.path / "eval.csv").exists() for run in runs) < count and time.monotonic() < deadline:
+        time.sleep(0.01)
 
 
 def test_everything_that_can_be_finished_is(small, tmp_path, stand_in):
@@ -69,9 +75,7 @@ def test_a_signal_stops_every_run_which_goes_on_later(small, tmp_path, stand_in,
     said: list[str] = []
 
     def when_both_run() -> None:
-        deadline = time.monotonic() + 30
-        while sum((run.path / "eval.csv").exists() for run in runs) < 2 and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until_at_work(runs, 2)
         os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=when_both_run)
@@ -90,6 +94,7 @@ def test_nothing_is_left_running_if_the_suite_itself_fails(small, tmp_path, stan
     stand_in({"seed1": [("wait", 100)], "seed2": [("finish", 400)]})
 
     def broken(queue, run, code):
+        wait_until_at_work(runs, 2)
         raise RuntimeError("a defect")
 
     monkeypatch.setattr(RunQueue, "ended", broken)
