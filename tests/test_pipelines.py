@@ -290,9 +290,7 @@ def test_rows_that_worker_processes_write_by_themselves_are_noticed():
     next(batches)
     buffer.sample()
     next(batches)
-    with pytest.raises(
-        RuntimeError, match="saw 24 writes but the storage holds 48 of 200 rows; write through this buffer"
-    ):
+    with pytest.raises(RuntimeError, match="the 24 writes that the sampler saw: it holds 48 of 200 rows; write thro"):
         buffer.sample()
     batches.close()
 

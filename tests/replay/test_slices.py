@@ -579,7 +579,7 @@ def test_rows_that_were_written_past_the_sampler_are_noticed():
     ring.write(contiguous([5], 4))
     ring.buffer.set_sampler(ring.sampler)
     with pytest.raises(
-        RuntimeError, match="saw 12 writes but the storage holds 16 of 20 rows; write through this buffer"
+        RuntimeError, match="not hold the 12 writes that the sampler saw: it holds 16 of 20 rows; write through this"
     ):
         ring.draw(1)
 
@@ -594,9 +594,7 @@ def test_rows_that_were_written_past_the_sampler_into_a_full_ring_are_noticed(nu
     ring.buffer.set_sampler(RandomSampler())
     ring.write(contiguous([5], number))
     ring.buffer.set_sampler(ring.sampler)
-    with pytest.raises(
-        RuntimeError, match="saw 33 writes but the storage holds 20 of 20 rows; write through this buff"
-    ):
+    with pytest.raises(RuntimeError, match="the 33 writes that the sampler saw: others have written to the full stor"):
         ring.draw(1)
 
 

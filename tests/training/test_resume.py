@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -259,12 +260,17 @@ def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(
     run_dir = shutil.copytree(finished, tmp_path / "run")
     for file in run_dir.glob("checkpoints/resume/*/manifest.json"):
         file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 2}))
-    with pytest.raises(
-        CheckpointError, match=r"^cannot resume: .*/000000000140 has checkpoint format 2; this version r"
-    ):
+    with pytest.raises(CheckpointError) as caught:
         make_run(small_config(), run_dir, resume=True)
-    _, _, counters = load_agent(run_dir / "checkpoints" / "last.pt")
+    agents = [run_dir / "checkpoints" / name for name in ("last.pt", "best.pt")]
+    assert re.match(r"cannot resume: .*/000000000140 has checkpoint format 2; this version r", str(caught.value))
+    left = f" Start a new run; the agents of this one can still be evaluated: {agents[0]}, {agents[1]}."
+    assert str(caught.value).endswith(left)
+    _, _, counters = load_agent(agents[0])
     assert counters["env_steps"] == 140
+    agents[0].write_bytes(agents[0].read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=rf"can still be evaluated: {agents[1]}\.$"):
+        make_run(small_config(), run_dir, resume=True)
 
 
 def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, make_run, read_table):

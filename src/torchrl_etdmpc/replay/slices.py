@@ -243,10 +243,11 @@ class StepSliceSampler(Sampler):
         if stored == min(self._written, capacity) and not (newest + 1 - self._written) % capacity and not missed:
             return
         if self._followed:
+            full = stored == capacity <= self._written
+            found = "others have written to the full storage" if full else f"it holds {stored} of {capacity} rows"
             raise RuntimeError(
-                f"the sampler saw {self._written} writes but the storage holds {stored} of {capacity} rows; write "
-                "through this buffer, in this process and in order, and save and load the sampler together with the "
-                "storage."
+                f"the storage does not hold the {self._written} writes that the sampler saw: {found}; write through "
+                "this buffer, in this process and in order, and save and load the sampler together with the storage."
             )
         if stored < capacity:
             newest = stored - 1

@@ -11,7 +11,7 @@ from torchrl import torchrl_logger
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, DamagedBufferError, Part
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.training.agent_file import BestAgent
+from torchrl_etdmpc.training.agent_file import BestAgent, read_agent_file
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.learner import Learner
 
@@ -38,6 +38,7 @@ class RunCheckpoints:
         self.config, self.learner, self.best, self.parts = config, learner, best, parts
         self.store = CheckpointStore(directory.checkpoints, keep=config.checkpoint_keep)
         self._links = {directory.last_agent: "agent"}
+        self._agents = directory.last_agent, directory.best_agent
         self._saved_at, self._saved_step = time.perf_counter(), -1
 
     @property
@@ -94,6 +95,13 @@ class RunCheckpoints:
                     f"{error} resume=weights goes on with the weights and what is left of the buffer."
                 ) from error
             folder = self._salvage()
+        except CheckpointError as error:
+            left = [str(path) for path in self._agents if _is_whole(path)]
+            if not left:
+                raise
+            raise CheckpointError(
+                f"{error} Start a new run; the agents of this one can still be evaluated: {', '.join(left)}."
+            ) from error
         self._saved_step = self.learner.env_steps
         torchrl_logger.info(f"going on from {folder} ({self._saved_step} env steps)")
 
@@ -109,3 +117,11 @@ class RunCheckpoints:
             )
         collector.set_seed((self.config.seed + collector.frames) % 2**32)  # the buffer may end in another episode
         return folder
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        read_agent_file(path)
+    except (CheckpointError, OSError):
+        return False
+    return True
