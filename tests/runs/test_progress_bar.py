@@ -61,12 +61,12 @@ def test_a_line_of_the_log_stands_above_the_bar_and_not_beside_it(monkeypatch):
 
 def test_a_file_gets_plain_lines_in_the_log_with_the_time_left(monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    with console(), progress_bar("learning", 1000, "env steps", log_every_s=0.05) as bar:
-        time.sleep(0.1)
-        bar.update(400, "return 31.2")
-        bar.update(401)
+    with console(), progress_bar("learning", 1000, "env steps", log_every_s=0.5) as bar:
+        time.sleep(0.6)
+        bar.update(990, "return 31.2")
+        bar.update(991)
     (line,) = capsys.readouterr().out.splitlines()
-    assert line[8:] == " learning: 400 of 1000 env steps, 0 s left, return 31.2"
+    assert line[8:] == " learning: 990 of 1000 env steps, 0 s left, return 31.2"
     assert sys.stderr.getvalue() == ""
 
 
