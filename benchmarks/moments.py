@@ -1,0 +1,101 @@
+"""How much does a run's return depend on the moment at which it is evaluated?
+
+    python benchmarks/moments.py runs/mine                    # goes on for 8 x 300 env steps
+    python benchmarks/moments.py runs/mine --every 100 --times 20 --out moments.csv
+
+Goes on from the last checkpoint of a run, in a copy of it, and every so many env steps plays the evaluation's episodes,
+the same ones each time: by the weights of that moment, by their running averages (decay per update) and by the policy
+of that moment without the planner. Prints a table, with the mean return of the training episodes that ended in between.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import math
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.runs import RunDirectory, RunLog
+from torchrl_etdmpc.training import TrainingRun, read_run_config
+
+DECAYS = (0.98, 0.995)
+COLUMNS = ("env_steps", "latest", *(f"average {decay}" for decay in DECAYS), "policy", "in training")
+
+
+@contextmanager
+def weights_of(parameters: list[Tensor], weights: list[Tensor]) -> Iterator[None]:
+    """The parameters hold these weights for a while."""
+    own = [parameter.detach().clone() for parameter in parameters]
+    with torch.no_grad():
+        torch._foreach_copy_(parameters, weights)
+    yield
+    with torch.no_grad():
+        torch._foreach_copy_(parameters, own)
+
+
+def moments(run: TrainingRun, every: int, times: int) -> Iterator[list[str]]:
+    """A row per moment; ``every`` is in env steps."""
+    parameters = [*run.learner.agent.world_model.parameters()]
+    averages = {decay: [parameter.detach().clone() for parameter in parameters] for decay in DECAYS}
+    latest = [parameter.detach() for parameter in parameters]  # follow the optimiser: they share its memory
+    for moment in range(times + 1):
+        goal = run.env_steps + every * (moment > 0)
+        while run.env_steps < goal:
+            run.learner.step(updates=True)
+            for decay, average in averages.items():
+                torch._foreach_lerp_(average, latest, 1 - decay)
+        result, returns = run.evaluator(), []
+        for average in averages.values():
+            with weights_of(parameters, average):
+                returns.append(run.evaluator().return_mean)
+        policy, trained = result.policy_return, run.learner.pop_row()["episode_return"]
+        numbers = (result.return_mean, *returns, math.nan if policy is None else policy, trained)
+        yield [str(run.env_steps), *("" if math.isnan(number) else f"{number:.0f}" for number in numbers)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run_dir", type=Path)
+    parser.add_argument("--every", type=int, default=300, help="env steps")
+    parser.add_argument("--times", type=int, default=8)
+    parser.add_argument("--out", type=Path, help="a CSV file")
+    arguments = parser.parse_args()
+    if not RunDirectory(arguments.run_dir).holds_a_run:
+        sys.exit(f"error: {arguments.run_dir} is not the directory of a run.")
+    if read_run_config(RunDirectory(arguments.run_dir)).optim.average_decay:
+        sys.exit("error: the run plans with averaged weights already; choose one with optim.average_decay=0.")
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        directory = RunDirectory(shutil.copytree(arguments.run_dir, Path(folder) / "run"))
+        config = dataclasses.replace(read_run_config(directory), eval_policy=True)
+        env = make_env(config.task_spec, seed=config.seed, num_envs=config.num_envs)
+        eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)
+        log = RunLog(directory, total_env_steps=config.total_env_steps)
+        run = TrainingRun(config, env=env, eval_env=eval_env, log=log)
+        directory.go_on()
+        run.checkpoints.restore()
+        run.precompile()
+        rows = []
+        print(*COLUMNS, sep="\t")
+        for row in moments(run, arguments.every, arguments.times):
+            rows.append(row)
+            print(*row, sep="\t", flush=True)
+        run.learner.collector.shutdown()
+        run.evaluator.close()
+    if arguments.out:
+        with open(arguments.out, "w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
+
+
+if __name__ == "__main__":
+    main()
