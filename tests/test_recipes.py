@@ -176,7 +176,7 @@ def test_a_checkpoint_without_the_new_content_says_so(tmp_path):
     run.log.directory.close()
     resumed = tiny_run(tmp_path / "run", resume=True)
     with_diary(resumed)
-    with pytest.raises(RuntimeError, match=r"^cannot resume: .* lacks diary\.$"):
+    with pytest.raises(RuntimeError, match=r"^cannot resume: .* lacks diary\. Start a new run;"):
         resumed.checkpoints.restore()
 
 
