@@ -77,7 +77,6 @@ def no_account(tmp_path, monkeypatch):
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("NETRC", str(tmp_path / "home" / "netrc"))
-    monkeypatch.setattr("torchrl_etdmpc.runs.loggers._WANDB_TIMEOUT_S", 4)
     yield
     wandb.teardown()
 
@@ -116,6 +115,7 @@ def test_a_run_that_goes_on_is_the_same_one_for_wandb(tmp_path, no_account):
 
 @pytest.mark.slow  # wandb asks for 20 seconds
 def test_a_service_that_cannot_be_reached_does_not_stop_a_run(tmp_path, monkeypatch, no_account):
+    monkeypatch.setattr("torchrl_etdmpc.runs.loggers._WANDB_TIMEOUT_S", 4)
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")  # nobody listens to the port of discard
     with pytest.warns(
@@ -145,6 +145,7 @@ class _Refusing(http.server.BaseHTTPRequestHandler):
 
 
 def test_a_key_that_is_wrong_does_not_stop_a_run(tmp_path, monkeypatch, no_account):
+    monkeypatch.setattr("torchrl_etdmpc.runs.loggers._WANDB_TIMEOUT_S", 4)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Refusing) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         monkeypatch.setenv("WANDB_API_KEY", "1" * 40)
