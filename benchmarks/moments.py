@@ -4,7 +4,7 @@
     python benchmarks/moments.py runs/mine --every 100 --times 20 --out moments.csv
 
 Goes on from the last checkpoint of a run, in a copy of it, and every so many env steps plays the evaluation's episodes,
-the same ones each time: by the weights of that moment, by their running averages (decay per update) and by the policy
+the same ones each time: by the weights of that moment, by their running averages (decay per decision) and by the policy
 of that moment without the planner. Prints a table, with the mean return of the training episodes that ended in between.
 """
 
@@ -13,7 +13,9 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import itertools
 import math
+import os
 import shutil
 import sys
 import tempfile
@@ -24,6 +26,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.checkpoints import CheckpointError
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog
 from torchrl_etdmpc.training import TrainingRun, read_run_config
@@ -70,13 +73,23 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=8)
     parser.add_argument("--out", type=Path, help="a CSV file")
     arguments = parser.parse_args()
+    if min(arguments.every, arguments.times) < 1:
+        sys.exit("error: --every and --times must be at least 1.")
     if not RunDirectory(arguments.run_dir).holds_a_run:
         sys.exit(f"error: {arguments.run_dir} is not the directory of a run.")
-    if read_run_config(RunDirectory(arguments.run_dir)).optim.average_decay:
-        sys.exit("error: the run plans with averaged weights already; choose one with optim.average_decay=0.")
+    try:
+        compare(arguments.run_dir, arguments.every, arguments.times, arguments.out)
+    except (CheckpointError, OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+
+
+def compare(run_dir: Path, every: int, times: int, out: Path | None) -> None:
+    """Prints the table and writes it to ``out``, row by row."""
+    if read_run_config(RunDirectory(run_dir)).optim.average_decay:
+        raise ValueError("the run plans with averaged weights already; choose one with optim.average_decay=0.")
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        directory = RunDirectory(shutil.copytree(arguments.run_dir, Path(folder) / "run"))
+    with tempfile.TemporaryDirectory() as folder, open(out or os.devnull, "w", newline="", encoding="utf-8") as file:
+        directory = RunDirectory(shutil.copytree(run_dir, Path(folder) / "run"))
         config = dataclasses.replace(read_run_config(directory), eval_policy=True)
         env = make_env(config.task_spec, seed=config.seed, num_envs=config.num_envs)
         eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)
@@ -85,16 +98,13 @@ def main() -> None:
         directory.go_on()
         run.checkpoints.restore()
         run.precompile()
-        rows = []
-        print(*COLUMNS, sep="\t")
-        for row in moments(run, arguments.every, arguments.times):
-            rows.append(row)
+        table = csv.writer(file, lineterminator="\n")
+        for row in itertools.chain([COLUMNS], moments(run, every, times)):
             print(*row, sep="\t", flush=True)
+            table.writerow(row)
+            file.flush()
         run.learner.collector.shutdown()
         run.evaluator.close()
-    if arguments.out:
-        with open(arguments.out, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def train(run_dir: Path, **changes: object) -> None:
     launch(TrainConfig.from_dict(values))
 
 
-def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, monkeypatch, capsys):
+def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, monkeypatch):
     train(tmp_path / "run")
     files = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
     script = runpy.run_path(str(SCRIPT))
@@ -61,6 +61,9 @@ def test_what_cannot_be_gone_on_with_is_one_line(tmp_path, monkeypatch):
     script = runpy.run_path(str(SCRIPT))
     monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path)])
     with pytest.raises(SystemExit, match="is not the directory of a run"):
+        script["main"]()
+    monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path), "--times", "0"])
+    with pytest.raises(SystemExit, match="--every and --times must be at least 1"):
         script["main"]()
     train(tmp_path / "averaged", optim=SMALL["optim"] | {"average_decay": 0.9})
     monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path / "averaged")])
