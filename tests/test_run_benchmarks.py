@@ -1,0 +1,117 @@
+"""``benchmarks/moments.py`` and ``benchmarks/frozen_agents.py`` on runs that were just made."""
+
+from __future__ import annotations
+
+import csv
+import runpy
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.training import TrainConfig, launch, preset
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+SMALL = {
+    "task": "cartpole-balance",
+    "device": "cpu",
+    "threads": 1,
+    "compile": "off",
+    "total_env_steps": 300,
+    "episode_length": 100,
+    "eval_every": 100,
+    "eval_episodes": 2,
+    "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16},
+    "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
+    "reanalyze": {"num_samples": 6, "num_elites": 3, "iterations": 1},
+    "optim": {"batch_size": 4},
+    "replay": {"seed_decisions": 40, "pretrain_updates": 4},
+}
+
+
+def train(run_dir: Path, **changes: object) -> None:
+    values = preset("cpu").to_dict()
+    for name, value in (SMALL | {"run_dir": str(run_dir)} | changes).items():
+        values[name] = values[name] | value if isinstance(value, dict) else value
+    launch(TrainConfig.from_dict(values))
+
+
+def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, monkeypatch):
+    train(tmp_path / "run")
+    files = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    script = runpy.run_path(str(BENCHMARKS / "moments.py"))
+    monkeypatch.setattr("sys.argv", [
+        "moments.py", str(tmp_path / "run"), "--every", "50", "--times", "4", "--out", str(tmp_path / "moments.csv"),
+    ])  # fmt: skip
+    script["main"]()
+    with open(tmp_path / "moments.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["env_steps"] for row in rows] == ["300", "350", "400", "450", "500"]
+    with open(RunDirectory(tmp_path / "run").eval, newline="", encoding="utf-8") as file:
+        last = list(csv.DictReader(file))[-1]
+    # The weights of the checkpoint, in the episodes that the run played; the averages begin with them.
+    assert {rows[0][name] for name in script["COLUMNS"][1:4]} == {f"{float(last['return_mean']):.0f}"}
+    assert any(row["in training"] for row in rows)
+    assert all(row["policy"] for row in rows)
+    assert len({row["average 0.98"] for row in rows}) > 1
+    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == files
+
+
+def test_what_moments_cannot_go_on_with_is_one_line(tmp_path, monkeypatch):
+    script = runpy.run_path(str(BENCHMARKS / "moments.py"))
+    monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path)])
+    with pytest.raises(SystemExit, match="is not the directory of a run"):
+        script["main"]()
+    monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path), "--times", "0"])
+    with pytest.raises(SystemExit, match="--every and --times must be at least 1"):
+        script["main"]()
+    train(tmp_path / "averaged", optim=SMALL["optim"] | {"average_decay": 0.9})
+    monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path / "averaged")])
+    with pytest.raises(SystemExit, match="plans with averaged weights already"):
+        script["main"]()
+
+
+def test_agents_play_with_other_settings_of_the_planner(tmp_path, monkeypatch, capsys):
+    for seed in (1, 2):
+        train(tmp_path / f"seed{seed}", seed=seed)
+    runs, out = [str(tmp_path / f"seed{seed}") for seed in (1, 2)], tmp_path / "table.csv"
+    command = ["frozen_agents.py", *runs, "--episodes", "3", "--out", str(out), "--changes", "elite"]
+    script = runpy.run_path(str(BENCHMARKS / "frozen_agents.py"))
+    monkeypatch.setattr("sys.argv", command)
+    script["main"]()
+    first = pd.read_csv(out)
+    assert list(first["setting"]) == ["as trained"] * 2 + ["elite"] * 2
+    assert set(first["seed"]) == {1, 2}
+    assert (first["episodes"] == 3).all()
+
+    # What is written is not played again; what each change does is said for the agents that have it.
+    monkeypatch.setattr("sys.argv", [*command, "policy alone", "beta 3"])
+    capsys.readouterr()
+    script["main"]()
+    both = pd.read_csv(out)
+    pd.testing.assert_frame_equal(both[:4], first)
+    assert list(both["setting"][4:]) == ["policy alone"] * 2 + ["beta 3"] * 2
+    means = both.groupby("setting")["return_mean"].mean()
+    printed = next(line for line in reversed(capsys.readouterr().out.splitlines()) if "policy alone" in line).split()
+    assert printed[-4] == f"{means['policy alone'] - means['as trained']:.0f}"
+    effects = script["effects"](both).set_index("setting")
+    assert effects.loc["elite", "difference"] == pytest.approx(means["elite"] - means["as trained"])
+    assert effects.loc["elite", "low"] <= effects.loc["elite", "difference"] <= effects.loc["elite", "high"]
+
+    monkeypatch.setattr("sys.argv", [*command[:3], "--episodes", "2", *command[5:]])
+    with pytest.raises(SystemExit, match="has other numbers of episodes than 2"):
+        script["main"]()
+    monkeypatch.setattr("sys.argv", [command[0], runs[0], *command[1:]])
+    with pytest.raises(SystemExit, match="several runs have the same task and seed"):
+        script["main"]()
+
+
+def test_frozen_agents_refuses_what_it_cannot_play(tmp_path, monkeypatch):
+    script = runpy.run_path(str(BENCHMARKS / "frozen_agents.py"))
+    monkeypatch.setattr("sys.argv", ["frozen_agents.py", str(tmp_path), "--out", str(tmp_path / "table.csv")])
+    with pytest.raises(SystemExit, match=r"has no checkpoints/last\.pt; name directories of runs"):
+        script["main"]()
+    monkeypatch.setattr("sys.argv", ["frozen_agents.py", "x", "--episodes", "0", "--out", str(tmp_path / "table.csv")])
+    with pytest.raises(SystemExit, match="--episodes must be at least 1"):
+        script["main"]()
