@@ -21,7 +21,7 @@ EQUATIONS = (
     Equation(
         "thesis Eq. 2.11",
         "consistency of a head's rollout with the encodings",
-        r"\rho^k \lVert \hat z_{k+1,i} - \mathrm{sg}(z_{k+1}) \rVert^2",
+        r"\frac{\rho^k}{L} \lVert \hat z_{k+1,i} - \mathrm{sg}(z_{k+1}) \rVert^2",
         f"{_OBJECTIVES}.consistency_error",
         ("tests/objectives/test_world_model_loss.py",),
     ),
@@ -156,8 +156,8 @@ EQUATIONS = (
     ),
     Equation(
         "thesis 2.3",
-        "the discount that a task's length suggests",
-        r"\mathrm{clip}\left(\frac{T/5 - 1}{T/5}, 0.95, 0.995\right)",
+        "the discount that episodes of $E$ decisions suggest",
+        r"\mathrm{clip}\left(\frac{E/5 - 1}{E/5}, 0.95, 0.995\right)",
         f"{_FUNCTIONAL}.discount_from_episode_length",
         ("tests/functional/test_returns.py::test_the_discount_heuristic_gives_the_published_discounts",),
     ),

@@ -193,7 +193,7 @@ def configuration() -> str:
 def command_help(command: str, *topics: str) -> str:
     """What a command answers to ``--help``, at 88 columns."""
     out = io.StringIO()
-    arguments = [f"torchrl-etdmpc {command.replace('_', '-')}", *topics, "--help"]
+    arguments = [f"torchrl-etdmpc {command}", *topics, "--help"]
     with (
         mock.patch.object(sys, "argv", arguments),
         mock.patch.dict("os.environ", {"COLUMNS": "88"}),

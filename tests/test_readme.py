@@ -14,6 +14,7 @@ import yaml
 
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig
 from torchrl_etdmpc.commands.export import ExportConfig
+from torchrl_etdmpc.commands.inspect_planner import InspectConfig
 from torchrl_etdmpc.commands.study import StudyConfig
 from torchrl_etdmpc.envs import check_env, import_task, make_env
 from torchrl_etdmpc.training import PRESETS, DistributedConfig, TrainConfig
@@ -145,8 +146,8 @@ def test_a_command_names_settings_and_options_that_exist(command, own_module, mo
     runpy.run_path(str(path), run_name="__main__")  # prints the settings and does nothing else
     settings = yaml.safe_load(capsys.readouterr().out)
     kinds = {"evaluate.py": EvaluateConfig, "export.py": ExportConfig, "distributed.py": DistributedConfig}
-    kinds |= {"study.py": StudyConfig}
-    if path.name == "evaluate.py":  # what is not named is taken from the checkpoint
+    kinds |= {"study.py": StudyConfig, "inspect_planner.py": InspectConfig}
+    if path.name in ("evaluate.py", "inspect_planner.py"):  # what is not named is taken from the checkpoint
         settings["planner"] = {name: value for name, value in settings["planner"].items() if value is not None}
     config_from_dict(kinds.get(path.name, TrainConfig), settings)
 

@@ -9,7 +9,8 @@ replay buffer and a plain Adam; nothing of this package's training code is used.
 # %%
 # Environment and networks
 # ------------------------
-# Two transforms make any Gymnasium environment fit: actions in [-1, 1], and a mark on the first step of an episode.
+# Two transforms make Pendulum fit: actions in [-1, 1], and a mark on the first step of an episode. MuJoCo's tasks also
+# need ``DoubleToFloat(in_keys=["observation"])``; ``check_env`` says what an environment lacks.
 
 import matplotlib.pyplot as plt
 import torch

@@ -10,7 +10,7 @@ have changed since. Reanalyze makes some of them anew. This page measures what g
 # The experiment
 # --------------
 # A small agent acts on Pendulum for 360 decisions, with one update each after the first sixty. Three times: without
-# reanalyze, with one batch in 20 made anew, and with one in 5.
+# reanalyze, with a quarter of one batch in 20 made anew, and of one in 5.
 
 import matplotlib.pyplot as plt
 import torch
@@ -104,7 +104,7 @@ def staleness(rows, world_model, fresh):
 
 rows, world_model, fresh, _, _ = results[20]
 age, kl, floor = staleness(rows, world_model, fresh)
-planned = age < 300  # the random phase stored no plans
+planned = age < 300  # without the random phase, whose plans are N(0, 1)
 edges = torch.arange(0, 301, 30)
 middles, medians = [], []
 for low, high in zip(edges[:-1], edges[1:], strict=True):
