@@ -39,3 +39,8 @@ def test_mish_is_pytorch_s_unless_it_is_compiled(monkeypatch):
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     monkeypatch.setattr(F, "mish", None)
     torch.testing.assert_close(mish(x), plain)
+
+
+def test_mish_in_half_precision_does_not_overflow_where_it_is_compiled(compiling):
+    x = torch.tensor([1.0, 5.6, 12.0, 300.0], dtype=torch.float16)
+    torch.testing.assert_close(mish(x), F.mish(x.float()).half())

@@ -329,4 +329,20 @@ def test_a_non_finite_depth_never_gives_a_finite_value_to_rank_by_nor_reaches_ot
 def test_a_negative_beta_is_refused_with_the_remedy():
     with pytest.raises(ValueError) as error:
         adaptive_mixture(torch.zeros(3), torch.ones(3), -0.5)
-    assert str(error.value) == ("adaptive_mixture needs beta >= 0, got -0.5; use the final or mean score for optimism.")
+    assert str(error.value) == (
+        "adaptive_mixture needs a finite beta >= 0, got -0.5; use the final or mean score for optimism."
+    )
+
+
+@pytest.mark.parametrize("beta", [math.nan, math.inf])
+def test_a_beta_that_is_not_finite_is_refused(beta):
+    with pytest.raises(ValueError, match="needs a finite beta"):
+        adaptive_mixture(torch.zeros(3), torch.ones(3), beta)
+
+
+def test_half_precision_gives_what_single_precision_does():
+    mean, std = (100 * normal(20, 6)).half(), torch.cat([torch.zeros(10, 6), uniform(10, 6)]).half()
+    value, weights = adaptive_mixture(mean, std, 1.0)
+    assert value.dtype == weights.dtype == torch.float16
+    for got, expected in zip((value, weights), adaptive_mixture(mean.float(), std.float(), 1.0), strict=True):
+        torch.testing.assert_close(got, expected.half())

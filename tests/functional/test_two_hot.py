@@ -163,3 +163,34 @@ def test_cross_entropy_broadcasts_one_target_over_heads():
     loss = two_hot_cross_entropy(logits, target, BINS)
     assert loss.shape == (2, 3)
     torch.testing.assert_close(loss[1, 2], two_hot_cross_entropy(logits[1, 2], target[2], BINS))
+
+
+def test_under_autocast_a_value_is_still_the_fixed_point_of_its_own_targets():
+    # A critic that fits each target as far as its logits can: rewards of 1 for ever, discounted by 0.99.
+    values = []
+    for autocast in (False, True):
+        value = torch.tensor(0.0)
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            for _ in range(1_500):
+                logits = two_hot_encode(1 + 0.99 * value, BINS).float().clamp_min(1e-30).log()
+                value = two_hot_decode(logits, BINS)
+            assert value.dtype == torch.float32
+        values.append(value.item())
+    assert values == pytest.approx([100, 100], abs=0.1)
+    with torch.autocast("cpu", torch.bfloat16):
+        decoded = two_hot_decode(logits.bfloat16(), BINS)
+    torch.testing.assert_close(decoded, two_hot_decode(logits.bfloat16().float(), BINS))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_scalars_in_half_precision_are_placed_as_exactly_as_they_are_given(dtype):
+    x = torch.tensor([0.03, 3.0, 50.0, 700.0]).to(dtype)
+    torch.testing.assert_close(two_hot_encode(x, BINS), two_hot_encode(x.float(), BINS), rtol=0, atol=0)
+
+
+def test_autocast_leaves_the_cross_entropy_of_half_precision_logits_in_single_precision():
+    logits = torch.randn(5, 101, generator=torch.Generator().manual_seed(3)).bfloat16()
+    target = torch.linspace(-3, 3, 5)
+    with torch.autocast("cpu", torch.bfloat16):
+        error = two_hot_cross_entropy(logits, target, BINS)
+    torch.testing.assert_close(error, two_hot_cross_entropy(logits.float(), target, BINS), rtol=0, atol=0)

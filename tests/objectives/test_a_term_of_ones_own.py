@@ -11,7 +11,13 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc import EfficientTDMPCLoss, WorldModel
-from torchrl_etdmpc.objectives import LatentRollout, LatentRolloutLoss, Slices, Term, latent_rollout
+from torchrl_etdmpc.objectives import (
+    LatentRollout,
+    LatentRolloutLoss,
+    Slices,
+    Term,
+    latent_rollout,
+)
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
 
@@ -264,3 +270,29 @@ def test_a_term_of_another_shape_is_answered_with_the_right_one(make_loss, slice
         ValueError, match=r"^the term 'scalar' must return an error of shape \[T, B\]=\[3, 4\], got \[\]\.$"
     ):
         loss(slices)
+
+
+@pytest.mark.parametrize(
+    ("metric", "kind"), [(lambda error: error > 0, "torch.bool"), (lambda error: 3.0, "float")], ids=["bool", "number"]
+)
+def test_a_metric_that_has_no_mean_is_refused(make_loss, slices, metric, kind):
+    def term(world_model, slices, rollout):
+        error = slices.action.square().mean(-1)
+        return error, {"seen": metric(error)}
+
+    loss = make_loss("whole", extra_terms=[Term("mine", term, metrics=("mine_error", "seen"))])
+    with pytest.raises(ValueError, match=f"the metric 'seen' of the term 'mine' must be a floating .* got {kind};"):
+        loss(slices)
+
+
+def test_a_scalar_cannot_have_the_name_of_the_loss_s_own(world_model):
+    with pytest.raises(ValueError, match="metrics and scalars must have names of their own, got 'rho'"):
+        EfficientTDMPCLoss(
+            world_model, discount=0.99, extra_terms=[Term("mine", lambda *_: None, scalars={"rho": 3.0})]
+        )
+
+
+@pytest.mark.parametrize("coef", [float("nan"), float("inf")])
+def test_a_coefficient_that_is_not_finite_is_refused(world_model, coef):
+    with pytest.raises(ValueError, match=f"reward_coef must be finite, got {coef}"):
+        EfficientTDMPCLoss(world_model, discount=0.99, reward_coef=coef)

@@ -76,5 +76,42 @@ def test_the_compiled_loss_equals_the_eager_one_in_numbers_gradients_and_scale(
 @pytest.mark.parametrize("key", ["loc", "scale"])
 def test_a_plan_of_another_action_is_refused(make_loss, slices, key):
     slices["plan", key] = slices["plan", key][..., :1]
-    with pytest.raises(ValueError, match=rf"got \('plan', '{key}'\) of shape \[\d+, \d+, 1\]"):
+    with pytest.raises(ValueError, match=rf"needs 3 features .* of \('plan', '{key}'\), got 1"):
         make_loss("policy")(slices)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("observation", lambda x: x[..., :2], r"needs 5 features in the last dimension of 'observation', got 2"),
+        (("next", "observation"), lambda x: x.double(), r"needs \('next', 'observation'\) in torch.float32, .*float64"),
+        ("action", lambda x: x[..., :1], r"needs 3 features in the last dimension of 'action', got 1"),
+        ("action", lambda x: x.double(), r"needs 'action' in torch.float32, as the weights are, got torch.float64"),
+        ("action", lambda x: x.long(), r"needs continuous actions in \[-1, 1\], got 'action' of torch.int64"),
+        (
+            ("next", "reward"),
+            lambda x: x.expand(*x.shape[:-1], 2),
+            r"needs 1 features .* \('next', 'reward'\), got 2",
+        ),
+    ],
+)
+def test_an_entry_that_does_not_fit_is_named(make_loss, slices, key, change, message):
+    slices[key] = change(slices[key])
+    with pytest.raises(ValueError, match=message):
+        make_loss("whole")(slices)
+
+
+def test_flags_of_other_kinds_count_as_flags(make_loss, world_model, slices, run_seeded, assert_same_output):
+    loss = make_loss("whole", world_model).eval()
+    slices["collector", "mask"] = torch.ones(slices.shape, dtype=torch.bool)
+    expected = run_seeded(loss, slices)
+    slices["next", "terminated"] = slices["next", "terminated"].float()
+    assert_same_output(run_seeded(loss, slices), expected)
+
+
+def test_a_plan_without_a_scale_in_one_dimension_is_no_plan(make_loss, world_model, slices, run_seeded):
+    loss = make_loss("policy", world_model).eval()
+    slices["plan", "scale"][0, 0] = 0
+    expected = run_seeded(loss, slices)
+    slices["plan", "scale"][0, 0] = torch.tensor([0.0, -1.0, 0.5])
+    torch.testing.assert_close(run_seeded(loss, slices)["loss_policy"], expected["loss_policy"])

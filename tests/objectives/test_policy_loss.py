@@ -289,3 +289,10 @@ def test_a_batch_without_plans_is_a_policy_loss_of_zero(make_loss, slices):
 def test_a_scale_that_is_no_number_is_not_taken_for_a_missing_plan(make_loss, slices):
     slices["plan", "scale"][0, 0, 1] = torch.nan
     assert make_loss("policy")(slices)["loss_policy"].isnan()
+
+
+def test_drawing_new_weights_begins_the_running_scale_anew(make_loss):
+    loss = make_loss("whole")
+    loss.kl_scale.fill_(50)
+    loss.reset_parameters_recursive()
+    assert loss.kl_scale == 1

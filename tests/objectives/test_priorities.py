@@ -61,7 +61,15 @@ def test_the_weights_can_be_left_aside(loss, slices, run_seeded, assert_same_out
     expected = run_seeded(loss.eval(), slices)
     loss.use_prioritized_weights = False
     assert_same_output(run_seeded(loss, weighted(slices)), expected, rtol=0, atol=0)
-    assert "td_error" not in slices.keys()
+
+
+def test_priorities_are_written_whether_the_weights_count_or_not(make_loss, world_model, slices, run_seeded):
+    loss = make_loss("whole", world_model).eval()
+    run_seeded(loss, weighted(slices))
+    expected = slices.pop("td_error")
+    loss.use_prioritized_weights = False
+    run_seeded(loss, slices)
+    torch.testing.assert_close(slices["td_error"], expected, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("kind", ["whole", "value"])

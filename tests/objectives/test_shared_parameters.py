@@ -162,6 +162,18 @@ def test_weights_that_others_took_the_place_of_are_noticed(make_loss, make_world
     loss = make_loss("whole")
     loss.world_model.load_state_dict(make_world_model().state_dict())
     loss(slices)
+    # A layer, not the first one.
+    other = make_world_model()
+    loss.world_model.reward_head.output = other.reward_head.output
+    with pytest.raises(RuntimeError, match=r"the weights of world_model\.reward_head are others .* or layer put"):
+        loss(slices)
+
+
+def test_a_copy_and_a_cast_loss_still_know_their_weights(make_loss, slices):
+    loss = make_loss("whole")
+    loss(slices)
+    for twin in (copy.deepcopy(loss), pickle.loads(pickle.dumps(loss)), loss.double()):
+        twin(slices if twin is not loss else slices.double())
 
 
 def test_a_world_model_that_was_cast_without_its_loss_is_noticed(make_loss, slices):

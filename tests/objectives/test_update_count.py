@@ -149,3 +149,45 @@ def test_a_world_model_that_nobody_holds_is_let_go(make_loss, make_world_model):
     del loss
     gc.collect()
     assert alive() is None
+
+
+@pytest.mark.parametrize("stage", ["frozen", "deleted"])
+def test_a_later_optimizer_that_holds_less_goes_on_counting(make_loss, world_model, slices, total, stage):
+    loss = make_loss("whole", world_model)
+    optimizer = torch.optim.Adam(loss.parameters())
+    train(loss, optimizer, slices=slices, total=total)
+    rest = [p for name, p in loss.named_parameters() if not name.startswith("encoder")]
+    if stage == "frozen":
+        world_model.encoder.requires_grad_(False)
+    else:
+        del optimizer
+        gc.collect()
+    later = torch.optim.Adam(rest)
+    train(loss, later, slices=slices, total=total)
+    assert world_model.version == 6
+
+
+def test_freezing_what_the_counting_optimizer_holds_first_makes_no_other_one_count(
+    make_loss, world_model, slices, total
+):
+    loss = make_loss("whole", world_model)
+    policy = {id(p) for p in world_model.policy.parameters()}
+    optimizers = [
+        torch.optim.Adam([p for p in loss.parameters() if id(p) not in policy]),
+        torch.optim.Adam(world_model.policy.parameters()),
+    ]
+    train(loss, *optimizers, slices=slices, total=total)
+    world_model.encoder.requires_grad_(False)
+    train(loss, *optimizers, slices=slices, total=total)
+    assert world_model.version == 6
+
+
+def test_an_optimizer_beside_the_one_that_counts_does_not(make_loss, world_model, slices, total):
+    loss = make_loss("whole", world_model)
+    whole, policy = torch.optim.Adam(loss.parameters()), torch.optim.Adam(world_model.policy.parameters())
+    train(loss, policy, whole, slices=slices, total=total)
+    # Its first step, before the other one's, could not know; from then on one of the two counts.
+    assert world_model.version in (3, 4)
+    before = int(world_model.version)
+    train(loss, whole, policy, slices=slices, total=total)
+    assert world_model.version == before + 3

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -17,7 +19,13 @@ from torchrl_etdmpc.testing import LineWorld
         ({"num_proposals": 24}, r"num_proposals must be in \[0, num_samples=24\), got 24\."),
         ({"num_proposals": -1}, r"num_proposals must be in \[0, num_samples=24\), got -1\."),
         ({"extra_iterations": -1}, r"extra_iterations must not be negative, got -1\."),
-        ({"inverse_temperature": -0.5}, r"inverse_temperature must not be negative, got -0\.5\."),
+        ({"inverse_temperature": -0.5}, r"inverse_temperature must be finite and not negative, got -0\.5\."),
+        ({"inverse_temperature": math.nan}, r"inverse_temperature must be finite and not negative, got nan\."),
+        ({"inverse_temperature": math.inf}, r"inverse_temperature must be finite and not negative, got inf\."),
+        ({"beta": math.nan}, r"beta must be finite, got nan\."),
+        ({"score": "adaptive", "beta": math.inf}, r"beta must be finite, got inf\."),
+        ({"score": FinalScore}, r"score must be an object, got the class FinalScore; pass FinalScore\(\.\.\.\)\."),
+        ({"std_max": math.inf}, r"std_max must be finite and positive, got inf\."),
         ({"std_min": 0.0}, r"std_min must be in \(0, std_max=2\.0\], got 0\.0\."),
         ({"std_min": 3.0}, r"std_min must be in \(0, std_max=2\.0\], got 3\.0\."),
         ({"discount": 0.0}, r"discount must be in \(0, 1\], got 0\.0\."),
@@ -51,7 +59,11 @@ from torchrl_etdmpc.testing import LineWorld
         ),
         (
             {"proposal_log_std_min": 1.0, "proposal_log_std_max": 1.0},
-            r"proposal_log_std_min must be below proposal_log_std_max=1\.0, got 1\.0\.",
+            r"proposal_log_std_min must be below proposal_log_std_max=1\.0 and both finite, got 1\.0\.",
+        ),
+        (
+            {"proposal_log_std_min": math.nan, "proposal_log_std_max": 1.0},
+            r"proposal_log_std_min must be below proposal_log_std_max=1\.0 and both finite, got nan\.",
         ),
     ],
 )

@@ -122,3 +122,10 @@ def test_an_episode_flag_may_lack_its_last_dimension(make_planner, states, run):
     assert not torch.equal(
         plans[0], run(planner, td.clone().set("is_init", torch.zeros(3, 1).bool()))["next", "plan_mean"]
     )
+
+
+def test_a_plan_of_another_planner_is_refused_by_its_shape(make_planner, states):
+    planner = make_planner(warm_start=True)
+    carried = TensorDict({"observation": states(2), "plan_mean": torch.zeros(2, 6, 2, dtype=torch.float64)}, [2])
+    with pytest.raises(ValueError, match=r"'plan_mean' holds a plan of shape \[6, 2\], this planner's are .*=\[3, 2\]"):
+        planner(carried)

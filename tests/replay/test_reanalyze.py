@@ -535,3 +535,22 @@ def test_a_sample_that_comes_as_slices_is_refreshed_like_a_flat_one():
         results.append((buffer.sample().reshape(-1), buffer.storage[:].clone(), reanalyze.refreshed))
     (flat, stored, count), (shaped, stored_too, count_too) = results
     assert (flat == shaped).all() and (stored == stored_too).all() and count == count_too == 6
+
+
+def test_a_transform_serves_one_buffer():
+    first, second = make_buffer(40), make_buffer(40)
+    reanalyze = make_reanalyze(first)
+    for buffer in (first, second):
+        with pytest.raises(ValueError, match="has a buffer already .* make one for each buffer"):
+            reanalyze.attach(buffer)
+    before = second[:].clone()
+    first.sample()
+    assert (second[:] == before).all()
+
+
+def test_a_storage_of_more_dimensions_is_refused():
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(40, ndim=2), writer=TensorDictRoundRobinWriter(track_generations=True), batch_size=6
+    )
+    with pytest.raises(ValueError, match=r"one-dimensional storage, got ndim=2; use LazyTensorStorage\(capacity\)"):
+        make_reanalyze(buffer)

@@ -454,7 +454,7 @@ REFUSED_BY_A_PART = [
     ({"planner__num_proposals": 512}, "planner.num_proposals must be in [0, num_samples=512), got 512."),
     ({"reanalyze__num_proposals": -1}, "reanalyze.num_proposals must be in [0, num_samples=64), got -1."),
     ({"planner__extra_iterations": -1}, "planner.extra_iterations must not be negative, got -1."),
-    ({"planner__inverse_temperature": -0.5}, "planner.inverse_temperature must not be negative, got -0.5."),
+    ({"planner__inverse_temperature": -0.5}, "planner.inverse_temperature must be finite and not negative, got -0.5."),
     ({"planner__std_min": 0.0}, "planner.std_min must be in (0, std_max=2.0], got 0.0."),
     ({"reanalyze__std_min": 3.0}, "reanalyze.std_min must be in (0, std_max=2.0], got 3.0."),
     (
@@ -465,7 +465,7 @@ REFUSED_BY_A_PART = [
     ({"reanalyze__num_slices": 0}, "reanalyze.num_slices must be at least 1, got 0."),
     (
         {"reanalyze__proposal_log_std_min": 2.0},
-        "reanalyze.proposal_log_std_min must be below proposal_log_std_max=1.0, got 2.0.",
+        "reanalyze.proposal_log_std_min must be below proposal_log_std_max=1.0 and both finite, got 2.0.",
     ),
     (
         {"reanalyze__proposal_log_std_min": None},

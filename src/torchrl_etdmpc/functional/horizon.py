@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -60,14 +62,19 @@ def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Te
         tuple[Tensor, Tensor]: the optimal value, shape ``[...]``, and the weights, shape ``[..., H]``.
 
     Raises:
-        ValueError: if beta is negative (the problem is then not concave).
+        ValueError: if beta is negative (the problem is then not concave) or not finite.
 
     >>> value, weights = adaptive_mixture(torch.tensor([1.0, 1.0]), torch.tensor([1.0, 1.0]), beta=1.0)
     >>> weights.tolist(), round(value.item(), 4)
     ([0.5, 0.5], 0.2929)
     """
-    if beta < 0:
-        raise ValueError(f"adaptive_mixture needs beta >= 0, got {beta}; use the final or mean score for optimism.")
+    if not 0 <= beta < math.inf:
+        raise ValueError(
+            f"adaptive_mixture needs a finite beta >= 0, got {beta}; use the final or mean score for optimism."
+        )
+    if mean.dtype == torch.float16:  # in which the floor's square is 0
+        value, weights = adaptive_mixture(mean.float(), std.float(), beta)
+        return value.to(mean.dtype), weights.to(mean.dtype)
     best, best_depth = mean.max(-1, keepdim=True)
     one_hot = torch.zeros_like(mean).scatter(-1, best_depth, 1.0)
     if beta == 0:

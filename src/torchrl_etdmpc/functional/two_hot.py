@@ -46,6 +46,7 @@ def two_hot_encode(x: Tensor, bins: Tensor) -> Tensor:
     1.0
     """
     num_bins = bins.shape[-1]
+    x = x.to(torch.promote_types(x.dtype, bins.dtype))  # half precision places a scalar in steps of half a bin
     width = (bins[-1] - bins[0]) / (num_bins - 1)
     position = ((symlog(x) - bins[0]) / width).clamp(0, num_bins - 1)
     index = torch.arange(num_bins, device=bins.device, dtype=bins.dtype)
@@ -67,6 +68,8 @@ def two_hot_decode(logits: Tensor, bins: Tensor) -> Tensor:
     >>> round(two_hot_decode(weights.clamp_min(1e-30).log(), bins).item(), 3)
     7.0
     """
+    if torch.is_autocast_enabled(logits.device.type):  # a product in half precision, of which values would learn
+        return symexp((logits.float().softmax(-1) * bins).sum(-1))
     return symexp(logits.softmax(-1) @ bins)
 
 
@@ -85,4 +88,6 @@ def two_hot_cross_entropy(logits: Tensor, target: Tensor, bins: Tensor) -> Tenso
     >>> two_hot_cross_entropy(torch.zeros(101), torch.tensor(1.5), bins).exp().round().item()
     101.0
     """
+    if torch.is_autocast_enabled(logits.device.type):
+        logits = logits.float()
     return -(two_hot_encode(target, bins) * logits.log_softmax(-1)).sum(-1)

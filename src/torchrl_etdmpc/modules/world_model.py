@@ -49,7 +49,8 @@ class WorldModel(nn.Module):
             :class:`~torchrl_etdmpc.modules.Encoder` of vectors.
 
     Raises:
-        ValueError: if an argument is out of range, or L is not a multiple of ``simnorm_dim``.
+        ValueError: if an argument is out of range, L is not a multiple of ``simnorm_dim``, or the encoder has dropout
+            or batch normalisation in training mode.
 
     >>> model = WorldModel(24, 6, latent_dim=32, mlp_dim=64)
     >>> latent = model.encode(torch.zeros(7, 24))
@@ -127,6 +128,8 @@ class WorldModel(nn.Module):
                 simnorm_dim=simnorm_dim,
                 activation=activation,
             )
+        else:
+            _refuse_training_mode(encoder)
         self.encoder = encoder
         self.dynamics = DynamicsEnsemble(
             latent_dim,
@@ -210,3 +213,15 @@ class WorldModel(nn.Module):
         """
         mean, log_std = self.policy(latent, log_std_bounds)
         return clipped_sample(mean, log_std.exp(), noise)
+
+
+def _refuse_training_mode(encoder: nn.Module) -> None:
+    """Raises where an encoder acts differently in training: planning and evaluations use the same one, in that mode."""
+    for name, layer in encoder.named_modules():
+        random = isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0
+        moving = isinstance(layer, nn.modules.batchnorm._NormBase) and layer.track_running_stats
+        if layer.training and (random or moving):
+            raise ValueError(
+                f"the encoder's {type(layer).__name__} {name!r} acts differently in training, and planning would use "
+                "it so; leave it out (LayerNorm and GroupNorm are fine), or freeze it with .eval() before."
+            )

@@ -162,6 +162,6 @@ def _action_value(
         loss.discount,
     )
     metrics = {"value_target": target}
-    if slices.weights is not None:
+    if slices.prioritised:
         metrics[PRIORITY] = action_td_error(world_model, rollout, slices, target)
     return action_value_error(world_model, rollout, slices, target, dropout=loss.training), metrics

@@ -39,6 +39,8 @@ class Slices(NamedTuple):
     all of them count."""
     weights: Tensor | None = None
     """``[T, B]``: how much each step counts in the losses, from a prioritised sampler. ``None``: all the same."""
+    prioritised: bool = False
+    """Whether the batch is a prioritised sampler's, and terms offer new priorities."""
     extra: Mapping[NestedKey, Tensor] | None = None
     """What else the terms read, by its key, ``[T, B, ...]``."""
 

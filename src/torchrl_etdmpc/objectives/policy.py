@@ -144,7 +144,7 @@ def _policy(
     heads = world_model.num_dynamics
     latent = head_rows(rollout.predicted[:-1])
     # Random actions of a collector have no plan, and zeros in its place: a scale of zero would make every gradient NaN.
-    planned = (slices.plan_scale != 0).any(-1)
+    planned = ~(slices.plan_scale <= 0).any(-1)  # what is no number is no missing plan either
     plan_scale = torch.where(planned.unsqueeze(-1), slices.plan_scale, 1)
     plan = head_rows(slices.plan_loc, heads), head_rows(plan_scale, heads)
     kl, entropy = distillation(world_model, latent, *plan, kl_direction=loss.kl_direction)

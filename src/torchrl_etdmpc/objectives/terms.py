@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, get_args
@@ -89,10 +90,17 @@ class Term:
         """Error ``[T, B]`` and metrics.
 
         Raises:
-            ValueError: if the shape of the error or the names of the metrics are others than stated.
+            ValueError: if the shape of the error, or the names or kinds of the metrics are others than stated.
         """
         result = self.function(world_model, slices, rollout)
         error, metrics = result if isinstance(result, tuple) else (result, {})
+        for name, metric in metrics.items():
+            if not isinstance(metric, Tensor) or not metric.is_floating_point():
+                kind = metric.dtype if isinstance(metric, Tensor) else type(metric).__name__
+                raise ValueError(
+                    f"the metric {name!r} of the term {self.name!r} must be a floating point tensor, got {kind}; "
+                    "convert it, e.g. with .float()."
+                )
         if error.shape != slices.action.shape[:2]:
             raise ValueError(
                 f"the term {self.name!r} must return an error of shape [T, B]={list(slices.action.shape[:2])}, got "
@@ -142,7 +150,8 @@ class LatentRolloutLoss(LossModule):
     Where a prioritised sampler has written ``priority_weight``, the mean is weighted by it, slice by slice, and the new
     priorities of the slices, the mean absolute errors of their values against the targets, are written into the batch
     at ``td_error``, for ``buffer.update_tensordict_priority(batch)``: the only entry that a loss writes to its input.
-    ``loss.use_prioritized_weights = False`` leaves the weights aside. A loss without values has no priority to offer.
+    ``loss.use_prioritized_weights = False`` leaves the weights aside, not the priorities. A loss without values has no
+    priority to offer.
 
     The term named ``"policy"`` can be turned off: ``loss.distill = False``, while pretraining on random data, say.
 
@@ -231,6 +240,8 @@ class LatentRolloutLoss(LossModule):
     q_scale: Tensor
     scale_tau: float
     kl_direction: KLDirection
+    _trained: dict[str, tuple[Tensor, set[int]]]
+    """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
 
     _attributes: ClassVar[dict[str, str]] = {
         "encoder": "encoder",
@@ -261,6 +272,7 @@ class LatentRolloutLoss(LossModule):
             raise ValueError(f"rho must be in (0, 1], got {rho}.")
         _check_terms(terms, extra_terms, taken=self._attributes)
         vars(self)["world_model"] = world_model
+        self._trained = {}
         self.terms = (*terms, *extra_terms)
         trained = {name for term in self.terms for name in term.networks}
         followed = {name for term in self.terms for name in term.targets}
@@ -271,6 +283,8 @@ class LatentRolloutLoss(LossModule):
         for term in self.terms:
             numbers = {f"{term.name}_coef": term.coef, **term.scalars}
             for name, number in numbers.items():
+                if not math.isfinite(number):
+                    raise ValueError(f"{name} must be finite, got {number}.")
                 self.register_coeff_buffer(name, float(number))
             self._scalars |= numbers.keys()
             if isinstance(term.function, nn.Module):
@@ -298,6 +312,7 @@ class LatentRolloutLoss(LossModule):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
+        self._trained = {}
         # The entries of <name>_params are the very parameters of the world model's networks, and planner, loss and
         # updater rely on it. A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__,
         # where convert_to_functional put them), but tensordict clones its entries: the loss would train weights that
@@ -320,7 +335,10 @@ class LatentRolloutLoss(LossModule):
             restart_count(self.world_model)
 
     def reset_parameters_recursive(self) -> None:
-        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones."""
+        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones.
+
+        Running scales begin anew.
+        """
         for name in self._attributes:
             if f"{name}_params" in self._modules:
                 draw_new_weights(self.__dict__[name])
@@ -331,6 +349,9 @@ class LatentRolloutLoss(LossModule):
         for name, target in parameters.items():
             if name.startswith("target_"):
                 target.data.update_(parameters[name.removeprefix("target_")].data)
+        for name in ("kl_scale", "q_scale"):
+            if name in self._buffers:
+                self.get_buffer(name).fill_(1)
 
     def network_parameters(self) -> dict[str, list[nn.Parameter]]:
         """Every parameter of this loss, once, by its network: of the world model, or of a term that brings its own."""
@@ -421,12 +442,15 @@ class LatentRolloutLoss(LossModule):
             if fields[name] is not None:
                 fields[name] = fields[name].squeeze(-1)
         counts = None if counts is None else counts.transpose(0, 1)
-        weights = tensordict.get(self.tensor_keys.priority_weight, None) if self.use_prioritized_weights else None
+        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        prioritised = weights is not None
+        if not self.use_prioritized_weights:
+            weights = None
         if weights is not None:
             # One weight per slice: that of its first row, which the sampler drew.
             steps, slices = fields["action"].shape[:2]
             weights = weights.reshape(slices, steps)[:, 0].expand(steps, slices).to(fields["action"].dtype)
-        return Slices(**fields, counts=counts, weights=weights, extra=entries or None)
+        return Slices(**fields, counts=counts, weights=weights, prioritised=prioritised, extra=entries or None)
 
     def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor | TensorDictBase:
         value = tensordict.get(key, None)
@@ -440,9 +464,30 @@ class LatentRolloutLoss(LossModule):
         vector = name in _FEATURES or (name in _OBSERVATIONS and self.world_model.observation_dim is not None)
         if value.ndim != 3 if vector else value.ndim < 2:
             raise self._shape_error(key, value)
-        if name in ("plan_loc", "plan_scale") and value.shape[-1] != self.world_model.action_dim:
-            raise self._shape_error(key, value)  # a last dimension of 1 would be spread over the action
+        if vector:
+            self._check_features(name, key, value)
         return value
+
+    def _check_features(self, name: NestedKey, key: NestedKey, value: Any) -> None:
+        """A last dimension of 1 would be spread over an action, and another size fail where no key is known."""
+        model = self.world_model
+        size = model.observation_dim if name in _OBSERVATIONS else 1 if name in ("reward", "terminated") else None
+        size = model.action_dim if size is None else size
+        if value.shape[-1] != size:
+            raise ValueError(
+                f"{type(self).__name__} needs {size} features in the last dimension of {key!r}, got {value.shape[-1]} "
+                f"(shape {list(value.shape)}); store the entry so, or build the world model for it."
+            )
+        if name == "action" and not value.is_floating_point():
+            raise ValueError(
+                f"{type(self).__name__} needs continuous actions in [-1, 1], got {key!r} of {value.dtype}; discrete "
+                "actions have no Gaussian policy."
+            )
+        if name in ("action", *_OBSERVATIONS) and value.dtype == torch.float64 != model.bins.dtype:
+            raise ValueError(
+                f"{type(self).__name__} needs {key!r} in {model.bins.dtype}, as the weights are, got {value.dtype}; "
+                "append DoubleToFloat() to the environment, or convert the batch."
+            )
 
     def _refuse_other_weights(self) -> None:
         if torch.compiler.is_compiling():
@@ -451,12 +496,16 @@ class LatentRolloutLoss(LossModule):
             held: Any = self._modules.get(f"{name}_params")
             if held is None:
                 continue
-            now, trained = next(getattr(self.world_model, attribute).parameters()), _first(held)
-            if now is not trained:
+            network, first = getattr(self.world_model, attribute), _first(held)
+            now = next(network.parameters())
+            if self._trained.get(name, (None,))[0] is not first:
+                own = (value for value in held.values(True, True) if isinstance(value, nn.Parameter))
+                self._trained[name] = first, {id(parameter) for parameter in own}
+            if now is not first or {id(parameter) for parameter in network.parameters()} != self._trained[name][1]:
                 raise RuntimeError(
                     f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
-                    "assign=True) and a new module put new parameters there; load without assign, or build the loss "
-                    "and its optimizer afterwards."
+                    "assign=True) and a new module or layer put new parameters there; load without assign, or build "
+                    "the loss and its optimizer afterwards."
                 )
             target: Any = self._modules.get(f"target_{name}_params")
             if target is not None and (_first(target).dtype, _first(target).device) != (now.dtype, now.device):
@@ -501,7 +550,7 @@ class LatentRolloutLoss(LossModule):
         if terminated is None or terminated.device.type != "cpu":
             return
         if counts is not None:
-            terminated = terminated.squeeze(-1) & counts
+            terminated = terminated.squeeze(-1).bool() & counts
         if terminated.any():
             raise ValueError(
                 f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
@@ -606,7 +655,7 @@ def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> 
 
 def _check_terms(terms: Sequence[Term], extra_terms: Sequence[Term], taken: Iterable[str]) -> None:
     """Raises where a name of a term, a number or a metric is there twice."""
-    names: set[str] = set(taken)
+    names: set[str] = {*taken, "rho"}
     for term in terms:
         names |= {term.name, f"{term.name}_coef", *term.scalars, *term.metric_names}
     for term in extra_terms:

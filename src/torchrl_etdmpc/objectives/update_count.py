@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from weakref import ReferenceType, WeakKeyDictionary, ref
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -17,11 +17,18 @@ from torchrl_etdmpc.modules import WorldModel
 class _Count(NamedTuple):
     trained: tuple[nn.Parameter, ...]
     """In the model's order."""
-    first: int
-    """The first of them that an optimiser which has stepped holds: that optimiser makes the updates. An optimiser need
-    not hold those that are frozen."""
     after: Tensor
     """The version that the last counted step left behind."""
+    counts: ReferenceType[Optimizer] | None = None
+    """The optimiser whose steps are the updates: of those that have stepped and are still there, the one that holds the
+    first parameter. It need not hold those that are frozen."""
+
+    def place(self, optimizer: Optimizer | None) -> int:
+        """Of the first trainable parameter that the optimiser holds; behind all of them if there is none."""
+        groups = [] if optimizer is None else optimizer.param_groups
+        held = {id(parameter) for group in groups for parameter in group["params"]}
+        places = (place for place, p in enumerate(self.trained) if p.requires_grad and id(p) in held)
+        return next(places, len(self.trained))
 
 
 _counts: WeakKeyDictionary[nn.Module, _Count] = WeakKeyDictionary()
@@ -46,7 +53,7 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
     if world_model in _counts:
         known |= {id(parameter) for parameter in _counts[world_model].trained}
     ordered = tuple(parameter for parameter in world_model.parameters() if id(parameter) in known)
-    _counts[world_model] = _Count(ordered, len(ordered), world_model.version.clone())
+    _counts[world_model] = _Count(ordered, world_model.version.clone())
 
 
 def restart_count(world_model: nn.Module) -> None:
@@ -61,11 +68,11 @@ def _listen() -> None:
 
 
 def _count(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-    held = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
     for world_model, count in list(_counts.items()):
-        first = next((place for place, parameter in enumerate(count.trained) if id(parameter) in held), None)
-        if first is not None and first <= count.first:
-            _counts[world_model] = count._replace(first=first)
+        place = count.place(optimizer)
+        counting = None if count.counts is None else count.counts()
+        if place < len(count.trained) and (optimizer is counting or place <= count.place(counting)):
+            _counts[world_model] = count._replace(counts=ref(optimizer))
             version = world_model.get_buffer("version")
             version += version != count.after.to(version.device) + 1
             restart_count(world_model)

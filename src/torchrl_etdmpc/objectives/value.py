@@ -185,6 +185,6 @@ def _value(
         world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
     )
     metrics = {"value_target": target}
-    if slices.weights is not None:
+    if slices.prioritised:
         metrics[PRIORITY] = td_error(world_model, rollout, target)
     return value_error(world_model, rollout, target, dropout=loss.training), metrics

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
@@ -373,6 +374,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                     stacklevel=3,
                 )
             return None, is_init is not None
+        if carried.shape[-2:] != (self.horizon, self.world_model.action_dim):
+            raise ValueError(
+                f"{self.plan_mean_key!r} holds a plan of shape {list(carried.shape[-2:])}, this planner's are "
+                f"[horizon, action_dim]={[self.horizon, self.world_model.action_dim]}; give planners that share an "
+                "environment a plan_mean_key of their own, and each its primer."
+            )
         if is_init is not None:
             starts = is_init.reshape(*carried.shape[:-2], 1, 1)  # [..., 1], or [...] as some environments write it
             carried = torch.where(starts, torch.zeros_like(carried), carried)
@@ -613,8 +620,10 @@ def _check_budget(
 def _check_fit(discount: float, inverse_temperature: float, std_min: float, std_max: float) -> None:
     if not 0 < discount <= 1:
         raise ValueError(f"discount must be in (0, 1], got {discount}.")
-    if inverse_temperature < 0:
-        raise ValueError(f"inverse_temperature must not be negative, got {inverse_temperature}.")
+    if not 0 <= inverse_temperature < math.inf:
+        raise ValueError(f"inverse_temperature must be finite and not negative, got {inverse_temperature}.")
+    if not 0 < std_max < math.inf:
+        raise ValueError(f"std_max must be finite and positive, got {std_max}.")
     if not 0 < std_min <= std_max:
         raise ValueError(f"std_min must be in (0, std_max={std_max}], got {std_min}.")
 
@@ -639,6 +648,6 @@ def _both_or_none(low: float | None, high: float | None) -> tuple[float, float] 
             f"proposal_log_std_min and proposal_log_std_max must be given together, got {low} and {high}; leave both "
             "out for the policy's own bounds."
         )
-    if low >= high:
-        raise ValueError(f"proposal_log_std_min must be below proposal_log_std_max={high}, got {low}.")
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(f"proposal_log_std_min must be below proposal_log_std_max={high} and both finite, got {low}.")
     return low, high

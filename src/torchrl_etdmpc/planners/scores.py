@@ -7,6 +7,7 @@ function has no such attribute and gets them all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, get_args, runtime_checkable
@@ -94,6 +95,9 @@ class FinalScore:
     beta: float = 0.0
     depths: Depths = field(default="last", init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        _require_finite(self.beta)
+
     def __call__(self, returns: Tensor) -> Tensor:
         return lower_confidence_bound(returns[..., -1, :, :], self.beta)
 
@@ -112,6 +116,9 @@ class MeanScore:
 
     beta: float = 0.0
     depths: Depths = field(default="all", init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        _require_finite(self.beta)
 
     def __call__(self, returns: Tensor) -> Tensor:
         return lower_confidence_bound(returns.mean(-3), self.beta)
@@ -136,6 +143,7 @@ class AdaptiveScore:
     depths: Depths = field(default="all", init=False, repr=False)
 
     def __post_init__(self) -> None:
+        _require_finite(self.beta)
         if self.beta < 0:
             raise ValueError(
                 f"beta must not be negative with the adaptive score, got {self.beta}; score='final' and score='mean' "
@@ -144,6 +152,11 @@ class AdaptiveScore:
 
     def __call__(self, returns: Tensor) -> Tensor:
         return adaptive_mixture(ensemble_mean(returns), ensemble_variance(returns).sqrt(), self.beta)[0]
+
+
+def _require_finite(beta: float) -> None:
+    if not math.isfinite(beta):
+        raise ValueError(f"beta must be finite, got {beta}.")
 
 
 SCORES: dict[ScoreName, Callable[..., Score]] = {"final": FinalScore, "mean": MeanScore, "adaptive": AdaptiveScore}
@@ -163,6 +176,8 @@ def make_score(score: ScoreName | Score | ScoreFunction, beta: float = 0.0) -> S
     >>> make_score("mean", 10.0)
     MeanScore(beta=10.0)
     """
+    if isinstance(score, type):
+        raise ValueError(f"score must be an object, got the class {score.__name__}; pass {score.__name__}(...).")
     if callable(score):
         if beta:
             raise ValueError(f"beta={beta} has no effect on a score of your own; put the penalty into the callable.")

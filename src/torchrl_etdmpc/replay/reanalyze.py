@@ -122,8 +122,8 @@ class ReanalyzeTransform(Transform):
             ReanalyzeTransform: itself.
 
         Raises:
-            ValueError: if the buffer's writer does not track generations, the buffer prefetches, or its sampler makes
-                slices of another length.
+            ValueError: if the buffer's writer does not track generations, the buffer prefetches, its storage has more
+                than one dimension, its sampler makes slices of another length, or the transform has a buffer already.
         """
         if not getattr(replay_buffer.writer, "tracks_generations", False):
             raise ValueError(
@@ -134,6 +134,16 @@ class ReanalyzeTransform(Transform):
             raise ValueError(
                 "reanalyze runs the planner inside sample(), which a prefetching buffer would do in a thread beside "
                 "the optimiser; build the buffer without prefetch."
+            )
+        if getattr(replay_buffer.storage, "ndim", 1) > 1:
+            raise ValueError(
+                f"reanalyze writes back row by row and needs a one-dimensional storage, got ndim="
+                f"{replay_buffer.storage.ndim}; use LazyTensorStorage(capacity) and write flat rows."
+            )
+        if self.replay_buffer is not None:
+            raise ValueError(
+                "this ReanalyzeTransform has a buffer already and would write the targets of one into the other; make "
+                "one for each buffer."
             )
         sampled = _sampled_slice_len(replay_buffer)
         if sampled not in (None, self.slice_len):

@@ -61,7 +61,7 @@ class StepSliceSampler(Sampler):
             sample of a ``TensorDictReplayBuffer`` has ``mask_key``, false there. Shapes stay as they are. Default:
             ``False``.
         as_slices (bool): whether a sample has the batch size ``[batch_size / T, T]``, as the losses take it, instead of
-            ``[batch_size]``. Default: ``False``.
+            ``[batch_size]``. TorchRL's ``ReplayBufferEnsemble`` counts rows and needs ``False``. Default: ``False``.
 
     Raises:
         ValueError: if an argument is out of range, a batch size is not a multiple of ``slice_len``, or the rows of the
