@@ -78,11 +78,21 @@ def test_an_encoder_that_is_empty_is_still_the_encoder(build):
     assert torch.equal(model.encode(latent), latent)
 
 
-@pytest.mark.parametrize("layer", [nn.Dropout(0.1), nn.BatchNorm1d(8)])
+@pytest.mark.parametrize(
+    "layer",
+    [
+        nn.Dropout(0.1),
+        nn.BatchNorm1d(8),
+        nn.RReLU(),
+        nn.MultiheadAttention(8, 2, dropout=0.1),
+        nn.LSTM(8, 8, num_layers=2, dropout=0.1),
+    ],
+    ids=lambda layer: type(layer).__name__,
+)
 def test_an_encoder_that_acts_differently_in_training_is_refused_unless_it_is_frozen(layer):
     encoder = nn.Sequential(nn.Linear(3, 8), layer.train())
     with pytest.raises(ValueError, match=rf"the encoder's {type(layer).__name__} '1' acts differently in training"):
         WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=encoder)
     WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=encoder.eval())
-    same = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.0), nn.LayerNorm(8), nn.GroupNorm(2, 8))
+    same = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.0), nn.LSTM(8, 8), nn.LayerNorm(8), nn.GroupNorm(2, 8))
     WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=same)

@@ -218,10 +218,11 @@ class WorldModel(nn.Module):
 def _refuse_training_mode(encoder: nn.Module) -> None:
     """Raises where an encoder acts differently in training: planning and evaluations use the same one, in that mode."""
     for name, layer in encoder.named_modules():
-        random = isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0
+        random = isinstance(layer, nn.RReLU) or (isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0)
+        random |= isinstance(layer, nn.MultiheadAttention | nn.RNNBase) and layer.dropout > 0
         moving = isinstance(layer, nn.modules.batchnorm._NormBase) and layer.track_running_stats
         if layer.training and (random or moving):
             raise ValueError(
                 f"the encoder's {type(layer).__name__} {name!r} acts differently in training, and planning would use "
-                "it so; leave it out (LayerNorm and GroupNorm are fine), or freeze it with .eval() before."
+                "it so; leave it, or its dropout, out (LayerNorm and GroupNorm are fine), or freeze it by .eval()."
             )
