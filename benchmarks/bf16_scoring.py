@@ -18,6 +18,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 from cpu_learning import ENV_STEPS, RESULTS, SEEDS, run
+from sized import FORMER_CPU
 
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import make_env
@@ -27,7 +28,7 @@ from torchrl_etdmpc.training import load_agent
 FOLDER = RESULTS / "bf16"
 TASK = "walker-stand"
 HALF = ("planner.scoring_dtype=bfloat16", "reanalyze.scoring_dtype=bfloat16")
-WIDTH = ("model.latent_dim=64", "model.mlp_dim=64")  # of the runs in float32
+SIZES = ("model.latent_dim=64", "model.mlp_dim=64", *FORMER_CPU)  # of the runs in float32
 EVERY = 10  # of the states of an evaluation episode are planned from
 
 
@@ -102,7 +103,7 @@ def main() -> None:
         keep = ("eval", "summary", "last_agent")
 
         def train(seed: int) -> str:
-            return run(TASK, seed, ENV_STEPS, *WIDTH, *HALF, target=FOLDER / f"seed{seed}", keep=keep)
+            return run(TASK, seed, ENV_STEPS, *SIZES, *HALF, target=FOLDER / f"seed{seed}", keep=keep)
 
         with ThreadPoolExecutor(2) as pool:
             for line in pool.map(train, SEEDS):

@@ -23,6 +23,7 @@ import tempfile
 from pathlib import Path
 
 import pandas as pd
+from sized import FORMER_CPU
 
 from torchrl_etdmpc.runs import RunDirectory
 
@@ -33,8 +34,8 @@ VARIANTS = {
     "multi": ("distributed.py", "workers=2", "engine=multi"),
     "ray": ("distributed.py", "workers=2", "engine=ray"),
 }
-# Half the size of the preset, for the time of nine runs: what is compared is who collects.
-SIZES = tuple(f"model.{name}=64" for name in ("latent_dim", "mlp_dim", "encoder_dim"))
+# Half the width of the preset, for the time of nine runs, and its settings of then; what is compared is who collects.
+SIZES = (*(f"model.{name}=64" for name in ("latent_dim", "mlp_dim", "encoder_dim")), *FORMER_CPU)
 SETTINGS = ("task=gym/Pendulum-v1", "preset=cpu", *SIZES, "total_env_steps=10000", "eval_every=2500")
 SEEDS = (1, 2, 3)
 

@@ -212,9 +212,12 @@ def test_evaluations_are_ten_episodes_every_50000_env_steps(name):
 def test_the_cpu_preset_shrinks_sizes_and_keeps_the_whole_method():
     settings = method_settings(preset("cpu"))
     sizes = {
-        *(f"model.{name}" for name in ("latent_dim", "mlp_dim", "encoder_dim", "num_dynamics", "activation")),
+        *(
+            f"model.{name}"
+            for name in ("latent_dim", "mlp_dim", "encoder_dim", "num_bins", "num_dynamics", "activation")
+        ),
         *(f"planner.{name}" for name in ("horizon", "num_samples", "num_elites", "num_proposals", "iterations")),
-        *(f"reanalyze.{name}" for name in ("num_samples", "num_elites", "num_proposals", "iterations", "num_slices")),
+        *(f"reanalyze.{name}" for name in ("num_samples", "num_elites", "num_proposals", "iterations")),
         *("loss.tau", "optim.batch_size", "optim.lr", "replay.pretrain_updates"),
     }
     changed = {name for name, value in settings.items() if value != UTD4[name]}
