@@ -1,4 +1,4 @@
-"""TD-MPC2 at the cpu preset's size beside the cpu preset, on walker-stand.
+"""TD-MPC2 at the cpu preset's size beside the cpu preset, on walker-stand, both as they were with 101 bins.
 
     python benchmarks/second_critic.py                 # one seed, some minutes
     python benchmarks/second_critic.py --seeds 1 2 3   # the committed runs
@@ -14,13 +14,14 @@ import argparse
 import json
 
 from cpu_learning import RESULTS, run
+from sized import FORMER_CPU
 
 from torchrl_etdmpc.analysis import estimate, plot_curves, read_runs
 from torchrl_etdmpc.runs import RunDirectory
 
 TASK, ENV_STEPS, PRESET = "walker-stand", 25_000, "tdmpc2-cpu"
 FOLDER = RESULTS / f"tdmpc2-{TASK}"
-BESIDE = RESULTS / "make_train"
+BESIDE = RESULTS / "bins-101" / "make_train"
 
 
 def report() -> str:
@@ -35,8 +36,8 @@ def report() -> str:
         "# TD-MPC2 at the cpu preset's size",
         "",
         f"Made by `python benchmarks/second_critic.py`: `preset={PRESET}` on {TASK}, one thread, beside the runs of",
-        f"`preset=cpu` in `{BESIDE.relative_to(RESULTS)}`. Return of every evaluation (mean of 10 episodes, planner",
-        "without noise) by env steps.",
+        f"`preset=cpu` in `{BESIDE.relative_to(RESULTS)}`, both as the presets were with 101 bins. Return of every",
+        "evaluation (mean of 10 episodes, planner without noise) by env steps.",
         "",
         "| preset | seed | " + " | ".join(f"{steps:.0f}" for steps in table.columns) + " |",
         "|---" * (2 + len(table.columns)) + "|",
@@ -62,7 +63,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.report_only:
         for seed in arguments.seeds:
-            print(run(TASK, seed, ENV_STEPS, preset=PRESET, target=FOLDER / f"seed{seed}"), flush=True)
+            print(run(TASK, seed, ENV_STEPS, *FORMER_CPU, preset=PRESET, target=FOLDER / f"seed{seed}"), flush=True)
     (FOLDER / "README.md").write_text(report())
     print(f"written: {FOLDER / 'README.md'}")
 
