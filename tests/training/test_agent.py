@@ -58,7 +58,7 @@ def test_the_networks_have_the_sizes_of_the_preset(name):
     assert weights["value_head.output.weight"] == (config.num_values, config.mlp_dim, config.num_bins)
     assert weights["policy.output.weight"][-1] == 2 * ACTION_DIM
     assert model.encode(torch.zeros(OBSERVATION_DIM)).shape == (config.latent_dim,)
-    assert (model.bins[0].item(), model.bins[-1].item(), len(model.bins)) == (-10, 10, 101)
+    assert (model.bins[0].item(), model.bins[-1].item(), len(model.bins)) == (-10, 10, 21 if name == "cpu" else 101)
     assert model.policy.log_std_bounds == (-3, 1)
     assert [layer.dropout for layer in model.value_head.hidden] == [0.01, 0]
     assert model.termination_head is None
