@@ -54,12 +54,8 @@ def plan_of(planner: EnsembleMPPIPlanner) -> Callable[..., Plan]:
 
 
 def assert_same_plan(plan, expected, variant: str = "eager") -> None:
-    """Up to rounding, which may swap elites of nearly the same score.
-
-    Half precision swaps more of them, and where there are three a swap may lead the search of a state elsewhere.
-    """
-    largest, mean, elsewhere = (0.5, 0.1, 0.1) if variant.endswith("bf16") else (0.1, 1e-2, 0)
+    """Up to rounding, which may swap elites of nearly the same score; half precision swaps more of them."""
+    largest, mean = (0.5, 0.1) if variant.endswith("bf16") else (0.1, 1e-2)
     for field in ("mean", "scale"):
         difference = (getattr(plan, field) - getattr(expected, field)).abs()
-        far = difference.flatten(1).amax(dim=1) >= largest  # of each state
-        assert far.float().mean() <= elsewhere and difference.mean() < mean, field
+        assert difference.max() < largest and difference.mean() < mean, field

@@ -82,8 +82,12 @@ def test_evaluating_candidates(measure, name, variant):
         measure(case, variant, lambda: call(latent, actions), rounds=3 * ROUNDS[name], flop=flop)
 
 
-@pytest.mark.parametrize("variant", SCORING)
-@pytest.mark.parametrize("name", PRESETS)
+# Not the preset cpu with bf16: of its three elites one swapped by rounding leads a search elsewhere, so that it is not
+# the same plan that would be timed.
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [(name, variant) for name in PRESETS for variant in SCORING if name != "cpu" or not variant.endswith("bf16")],
+)
 def test_reanalyze(measure, name, variant):
     config, reference = make_agent(name)
     _, agent = make_agent(name, variant)
