@@ -5,8 +5,8 @@
     python benchmarks/cpu_learning.py --report-only          # from the committed files
 
 Writes `benchmarks/results/cpu/<task>/seed<k>/{eval.csv,summary.json}`, `README.md` with budgets and wall times, and
-`report/` with the comparison to published curves, of the six tasks that have three seeds. Any other DMC task may be
-named. A run that is there already is kept; remove its folder to repeat it.
+`report/` with the comparison to published curves, of the six tasks that have three seeds; `untuned_returns.csv` has
+that of the others. Any DMC task may be named. A run that is there already is kept; remove its folder to repeat it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from torchrl_etdmpc.runs import RunDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
+UNTUNED = RESULTS / "untuned_returns.csv"
 TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch", "finger-spin", "walker-walk")
 ENV_STEPS = 50_000
 SEEDS = (1, 2, 3)
@@ -71,18 +72,20 @@ def folders(tasks: Sequence[str]) -> list[Path]:
     return found
 
 
-def write_report() -> None:
-    """Beside the published curves, up to the budget of these runs."""
-    command = [
-        sys.executable,
-        str(ROOT / "examples" / "report.py"),
-        *map(str, folders(TASKS)),
-        "--budget",
-        str(ENV_STEPS),
-    ]
+def report(tasks: Sequence[str], out: Path) -> None:
+    """Runs beside the published curves, up to the budget of these runs."""
+    command = [sys.executable, str(ROOT / "examples" / "report.py"), *map(str, folders(tasks))]
     # From 20,000 on, where several baselines were evaluated first: the area before is known of these runs alone.
-    command += ["--grid-step", "10000", "--grid-start", "20000"]
-    subprocess.run([*command, "--out", str(RESULTS / "report")], check=True)
+    command += ["--budget", str(ENV_STEPS), "--grid-step", "10000", "--grid-start", "20000", "--out", str(out)]
+    subprocess.run(command, check=True)
+
+
+def write_reports() -> None:
+    """The whole report of the six tasks, the returns of the others."""
+    report(TASKS, RESULTS / "report")
+    with tempfile.TemporaryDirectory() as folder:
+        report([task for task in DMC_TASKS if task not in TASKS], Path(folder))
+        shutil.copy(Path(folder) / "returns.csv", UNTUNED)
 
 
 def write_readme(table: pd.DataFrame) -> None:
@@ -118,7 +121,8 @@ def write_readme(table: pd.DataFrame) -> None:
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
     lines += [
         "",
-        "The tasks with three seeds beside published curves: [report](report/index.md).",
+        "The tasks with three seeds beside published curves: [report](report/index.md); the others: "
+        "[returns](untuned_returns.csv).",
         "",
         "![learning curves](report/curves.png)",
         "",
@@ -140,7 +144,7 @@ def main() -> None:
             for line in pool.map(lambda pair: run(*pair, arguments.env_steps), runs):
                 print(line, flush=True)
     write_readme(read_runs(folders(DMC_TASKS)))
-    write_report()
+    write_reports()
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ PAGES = (
         if not {"generated", "gallery"} & set(page.relative_to(ROOT).parts)  # written by make docs
     ),
 )
+MEAN = "Mean over tasks"
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in sorted(PAGES)}
 # A block that cannot run by itself is marked as "python fragment".
 BLOCKS = [(page, code) for page, text in TEXTS.items() for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
@@ -217,15 +218,34 @@ def test_the_columns_that_the_docs_name_are_those_of_a_run():
 
 
 def test_the_returns_that_the_pages_compare_are_those_of_the_committed_report():
-    with open(ROOT / "benchmarks" / "results" / "cpu" / "report" / "returns.csv", newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["env_steps"] == "50000" and row["task"] == "Mean over tasks"]
-    found = {row["method"]: f"{float(row['mean']):.0f}" for row in rows if row["tasks"] == "6"}
+    returns = _returns_at_the_end("report/returns.csv")
+    found = {method: value for (method, task), (value, tasks) in returns.items() if (task, tasks) == (MEAN, "6")}
     names = {"TD-MPC2": "TD-MPC2 (EZ-V2's figure)", "this": "cpu", "this, `cpu`": "cpu"}
     caption = re.search(
         r"Mean return of the six tasks at 50,000 env steps: (.*?) if it counts", TEXTS["README.md"], re.S
     )[1]
     quoted = re.findall(r"([A-Z][\w.-]+(?: V2)?|this) (\d{3})\b", caption)
-    table = re.findall(r"^\| ([^|]+) \| (\d{3})\b(?! and)", TEXTS["docs/results.md"], re.M)
+    table = re.findall(r"^\| ([^|]+) \| (\d{3})\b(?! and)[^|]*\| [^|]+ \|$", TEXTS["docs/results.md"], re.M)
     assert len(quoted) == 6 and len(table) == 8
     for method, value in (*quoted, *table):
         assert value == found[{**names, "DreamerV3": "DreamerV3 (author)"}.get(method, method)], method
+
+
+def test_the_returns_of_the_untuned_tasks_are_those_that_are_committed():
+    returns = _returns_at_the_end("untuned_returns.csv")
+    methods = ("cpu", "TD-MPC2 (EZ-V2's figure)", "EfficientZero V2", "DR.Q")
+    cell = r" (\d+|-) \|"
+    cells = re.findall(rf"^\| ([a-z-]+) \|{4 * cell}$", TEXTS["docs/results.md"], re.M)
+    rows = {MEAN if task == "mean" else task: values for task, *values in cells}
+    expected = {task: tasks for (method, task), (_, tasks) in returns.items() if method == "cpu"}
+    assert rows.keys() == expected.keys() and len(rows) > 1
+    for task, values in rows.items():
+        known = [returns.get((method, task), ("", "")) for method in methods]
+        assert values == [value if tasks == expected[task] else "-" for value, tasks in known], task
+
+
+def _returns_at_the_end(name: str) -> dict[tuple[str, str], tuple[str, str]]:
+    """Rounded return and number of tasks at 50,000 env steps, by method and task, of a committed table."""
+    with open(ROOT / "benchmarks" / "results" / "cpu" / name, newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["env_steps"] == "50000"]
+    return {(row["method"], row["task"]): (f"{float(row['mean']):.0f}", row["tasks"]) for row in rows}
