@@ -297,7 +297,13 @@ def _disturb(tensors) -> None:
 
 
 def _plain_errors(
-    loss: LossModule, slices: TensorDict, noise: Tensor, *, discount: float = 0.9, kl_direction: str = "backward"
+    loss: LossModule,
+    slices: TensorDict,
+    noise: Tensor,
+    *,
+    discount: float = 0.9,
+    value_beta: float = 0.0,
+    kl_direction: str = "backward",
 ) -> dict[str, Tensor]:
     """Unweighted errors ``[B, T]`` with gradient, without dropout.
 
@@ -306,6 +312,7 @@ def _plain_errors(
         slices (TensorDict): ``[B, T]``.
         noise (Tensor): the policy's noise in the value targets, ``[T, B, A]``.
         discount (float): of the value targets.
+        value_beta (float): as in the loss.
         kl_direction (str): as in the loss.
     """
     world_model = loss.world_model
@@ -351,7 +358,7 @@ def _plain_errors(
         with torch.no_grad():
             mean, std = policy(encoded[k])
             imagined_action = torch.clip(mean + std * noise[k], -1, 1)
-            future = 0.0
+            futures = []
             for i in range(num_dynamics):
                 imagined = step(i, encoded[k], imagined_action)
                 alive = 1.0
@@ -359,7 +366,10 @@ def _plain_errors(
                     alive = 1 - 1 / (1 + torch.exp(-termination_logit(imagined)))
                 for j in range(num_values):
                     value = _expected(_network(target_values, imagined, hidden=2, member=j), bins)
-                    future = future + alive * value / (num_dynamics * num_values)
+                    futures.append(alive * value)
+            future = torch.stack(futures).mean(0)
+            if value_beta:
+                future = future - value_beta * torch.stack(futures).std(0) / math.sqrt(len(futures))
             target = _expected(reward_logits(encoded[k], imagined_action), bins) + discount * future
         here: dict[str, list[Tensor]] = {}
         for i in range(num_dynamics):

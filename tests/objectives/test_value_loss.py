@@ -17,11 +17,12 @@ def _noise(slices, seed: int = 7):
 
 @pytest.mark.parametrize("kind", ["value", "whole"])
 @pytest.mark.parametrize("termination", [False, True])
+@pytest.mark.parametrize("value_beta", [0.0, 1.5])
 def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step(
-    make_world_model, make_loss, slices, run_seeded, plain_errors, depth_mean, kind, termination
+    make_world_model, make_loss, slices, run_seeded, plain_errors, depth_mean, kind, termination, value_beta
 ):
-    loss = make_loss(kind, make_world_model(termination=termination)).eval()
-    errors = plain_errors(loss, slices, _noise(slices))
+    loss = make_loss(kind, make_world_model(termination=termination), value_beta=value_beta).eval()
+    errors = plain_errors(loss, slices, _noise(slices), value_beta=value_beta)
     out = run_seeded(loss, slices)
     torch.testing.assert_close(out["value_target"], errors["value_target"].mean())
     torch.testing.assert_close(out["value_error"], errors["value"].mean().detach())  # knows neither coefficient nor rho
@@ -60,6 +61,24 @@ def test_the_bootstrap_comes_from_the_target_heads_that_are_passed(make_world_mo
     target = imagined_value_target(world_model, heads_that_say_one_and_five, latent, noise, 0.5)
     reward = world_model.reward(latent, world_model.act(latent, noise))
     torch.testing.assert_close(target, reward + 0.5 * 3.0)
+
+
+def test_a_beta_of_one_bootstraps_from_the_lesser_of_two_heads(make_world_model):
+    world_model = make_world_model(num_dynamics=1)
+    latent, noise = world_model.encode(torch.randn(7, 5)), torch.randn(7, 3)
+    action = world_model.act(latent, noise)
+    lesser = world_model.values(world_model.next(latent.unsqueeze(0), action)).amin((0, 2))
+    target = imagined_value_target(world_model, world_model.values, latent, noise, 0.9, beta=1.0)
+    torch.testing.assert_close(target, world_model.reward(latent, action) + 0.9 * lesser)
+
+
+def test_a_single_head_has_no_spread_to_be_pessimistic_about(make_world_model):
+    world_model = make_world_model(num_dynamics=1, num_values=1)
+    latent, noise = world_model.encode(torch.randn(7, 5)), torch.randn(7, 3)
+    plain, pessimistic = (
+        imagined_value_target(world_model, world_model.values, latent, noise, 0.9, beta=beta) for beta in (0.0, 10.0)
+    )
+    assert torch.equal(plain, pessimistic)
 
 
 def test_the_target_takes_the_policys_clipped_action(make_world_model):

@@ -117,6 +117,12 @@ def test_the_loss_and_the_updater_take_their_settings(tiny_agent):
     )
     assert {name: getattr(agent.loss, name).item() for name in loss} == loss
     assert (agent.loss.kl_direction, agent.loss.scale_tau) == ("forward", 0.125)
+    batch, targets = random_slices(OBSERVATION_DIM, ACTION_DIM), []
+    for pessimistic in (tiny_agent(), tiny_agent(loss={"value_beta": 100.0})):
+        with torch.no_grad():  # two heads that say -1 and 1 in symlog space
+            pessimistic.loss.target_value_params.data["output", "bias"].zero_()[..., [0, 1], [0, -1]] = 1e3
+        targets.append(pessimistic.loss(batch)["value_target"])
+    assert targets[1] < targets[0] - 100
     assert agent.updater.tau == 0.125
     assert agent.updater.grad_clip_norm == 7
     assert [group["lr"] for group in agent.updater.optimizer.param_groups] == [0.125, 0.5, 0.5]
@@ -235,3 +241,14 @@ def test_every_planner_plans_with_the_averaged_weights_if_asked(tiny_agent):
     assert agent.acting_model is not agent.world_model
     plain = tiny_agent()
     assert plain.planner.world_model is plain.acting_model is plain.world_model
+
+
+@pytest.mark.parametrize(
+    ("action_values", "loss"),
+    [(True, {"value_beta": 1.0}), (True, {"kl_direction": "forward"}), (False, {"squashed_entropy": False})],
+)
+def test_a_setting_that_the_kind_of_values_has_no_use_for_is_refused(tiny_agent, action_values, loss):
+    (name,) = loss
+    message = rf"loss\.{name} has no effect with model.action_values={str(action_values).lower()}, got .*; leave it at"
+    with pytest.raises(ValueError, match=message):
+        tiny_agent(model={"action_values": action_values}, loss=loss)

@@ -8,7 +8,7 @@ from torchrl_etdmpc.functional.gaussian import (
     gaussian_kl,
     tanh_log_slope,
 )
-from torchrl_etdmpc.functional.horizon import adaptive_mixture, ensemble_mean, ensemble_variance
+from torchrl_etdmpc.functional.horizon import adaptive_mixture, ensemble_mean, ensemble_variance, lower_confidence_bound
 from torchrl_etdmpc.functional.mppi import (
     Elites,
     Gaussian,
@@ -38,6 +38,7 @@ __all__ = [
     "fit_gaussian",
     "gaussian_entropy",
     "gaussian_kl",
+    "lower_confidence_bound",
     "return_table",
     "sample_elite",
     "sample_sequences",

@@ -1,4 +1,4 @@
-"""Reductions of the return table: ensemble mean, variance of the mean, and the exact adaptive horizon mixture."""
+"""Reductions of the return table: mean, variance of the mean and lower bound of the ensemble, mixture of depths."""
 
 from __future__ import annotations
 
@@ -42,6 +42,23 @@ def ensemble_variance(returns: Tensor) -> Tensor:
         return torch.zeros_like(returns[..., 0, 0])
     deviation = returns - returns.mean((-2, -1), keepdim=True)
     return deviation.square().sum((-2, -1)) / (members * (members - 1))
+
+
+def lower_confidence_bound(returns: Tensor, beta: float) -> Tensor:
+    """``mean - beta * sigma`` over the heads (thesis 3.4.3); beta < 0 is optimism.
+
+    Args:
+        returns (Tensor): return estimates, shape ``[..., F, V]``.
+        beta (float): weight of the standard deviation of the mean (thesis Eq. 3.3).
+
+    Returns:
+        Tensor: shape ``[...]``.
+
+    >>> lower_confidence_bound(torch.tensor([[1.0, 3.0]]), beta=1.0).item()  # of two heads the lesser one
+    1.0
+    """
+    mean = ensemble_mean(returns)
+    return mean if beta == 0 else mean - beta * ensemble_variance(returns).sqrt()
 
 
 def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,8 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         consistency_coef (float): Default: 20.
         reward_coef (float): Default: 0.1.
         value_coef (float): Default: 0.1.
+        value_beta (float): pessimism of the value targets, the weight of the ensemble's standard deviation, not
+            negative. Default: 0, the mean.
         termination_coef (float): used with a termination head. Default: 1.
         policy_coef (float): Default: 1.
         entropy_coef (float): Default: 1e-4.
@@ -64,6 +66,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         consistency_coef: float = 20.0,
         reward_coef: float = 0.1,
         value_coef: float = 0.1,
+        value_beta: float = 0.0,
         termination_coef: float = 1.0,
         policy_coef: float = 1.0,
         entropy_coef: float = 1e-4,
@@ -84,7 +87,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
                     reward_coef=reward_coef,
                     termination_coef=termination_coef,
                 ),
-                value_term(self, world_model, value_coef=value_coef, discount=discount),
+                value_term(self, world_model, value_coef=value_coef, value_beta=value_beta, discount=discount),
                 policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),
             ],
             extra_terms=extra_terms,

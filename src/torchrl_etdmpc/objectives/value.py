@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
+from torchrl_etdmpc.functional import lower_confidence_bound, two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term
@@ -23,11 +24,14 @@ def imagined_value_target(
     latent: Tensor,
     noise: Tensor,
     discount: float | Tensor,
+    beta: float = 0.0,
 ) -> Tensor:
     """One-step imagined TD target at encoded latents (thesis Eq. 2.16, and 3.2 with H = 1).
 
     ``y = R(z, a) + gamma mean_{i,j} (1 - p(f_i(z, a))) Vbar_j(f_i(z, a))``, ``a ~ pi(z)``; p is the predicted
-    probability of termination, 0 without a termination head.
+    probability of termination, 0 without a termination head. With ``beta``, the mean gives way to the lower bound
+    ``mean - beta sigma`` that planners have (thesis 3.4.3): with one dynamics head, two value heads and ``beta=1`` to
+    the lesser of two values (clipped double Q-learning, arXiv:1802.09477).
 
     Args:
         world_model (WorldModel): policy, reward and dynamics.
@@ -35,6 +39,7 @@ def imagined_value_target(
         latent (Tensor): encoded latents z, shape ``[..., L]``.
         noise (Tensor): standard normal draws for the policy's action, shape ``[..., A]``.
         discount (float or Tensor): gamma.
+        beta (float): weight of the standard deviation of the mean (thesis Eq. 3.3). Default: 0.
 
     Returns:
         Tensor: targets in the units of the return, without gradient, shape ``[...]``.
@@ -46,11 +51,11 @@ def imagined_value_target(
     """
     action = world_model.act(latent, noise)
     imagined = world_model.next(latent.unsqueeze(0), action)
-    bootstrap = target_values(imagined).mean(-1)
+    bootstrap = target_values(imagined)  # [F, ..., V]
     ended = world_model.termination(imagined)
     if ended is not None:
-        bootstrap = bootstrap * (1 - ended)
-    return world_model.reward(latent, action) + discount * bootstrap.mean(0)
+        bootstrap = bootstrap * (1 - ended).unsqueeze(-1)
+    return world_model.reward(latent, action) + discount * lower_confidence_bound(bootstrap.movedim(0, -2), beta)
 
 
 def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor, *, dropout: bool) -> Tensor:
@@ -110,6 +115,8 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
     Keyword Args:
         discount (float): gamma, in (0, 1].
         value_coef (float): weight of the term. Default: 0.1.
+        value_beta (float): pessimism of the targets, the weight of the ensemble's standard deviation, not negative.
+            Default: 0, the mean.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
@@ -133,25 +140,28 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         *,
         discount: float,
         value_coef: float = 0.1,
+        value_beta: float = 0.0,
         rho: float = 0.5,
         ignore_termination: bool = False,
         reduction: Reduction | None = None,
     ) -> None:
         super().__init__(
             world_model,
-            [value_term(self, world_model, value_coef=value_coef, discount=discount)],
+            [value_term(self, world_model, value_coef=value_coef, value_beta=value_beta, discount=discount)],
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,
         )
 
 
-def value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: float, discount: float) -> Term:
+def value_term(
+    loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: float, value_beta: float, discount: float
+) -> Term:
     """The term of the value heads, for any loss.
 
     Raises:
         TypeError: if the value heads read actions.
-        ValueError: if the discount is out of range.
+        ValueError: if the discount or ``value_beta`` is out of range.
     """
     if isinstance(world_model, ActionValueWorldModel):
         raise TypeError(
@@ -160,9 +170,11 @@ def value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: 
         )
     if not 0 < discount <= 1:
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
+    if not 0 <= value_beta < math.inf:
+        raise ValueError(f"value_beta must be finite and not negative, got {value_beta}; 0 is the mean of the heads.")
     return Term(
         "value",
-        partial(_value, loss),
+        partial(_value, loss, value_beta),
         value_coef,
         networks=("encoder", "dynamics", "value"),
         targets=("value",),
@@ -172,7 +184,7 @@ def value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: 
 
 
 def _value(
-    loss: LatentRolloutLoss, world_model: WorldModel, slices: Slices, rollout: LatentRollout
+    loss: LatentRolloutLoss, value_beta: float, world_model: WorldModel, slices: Slices, rollout: LatentRollout
 ) -> tuple[Tensor, dict[str, Tensor]]:
     targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
 
@@ -182,7 +194,7 @@ def _value(
 
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
     target = imagined_value_target(
-        world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount
+        world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount, value_beta
     )
     metrics = {"value_target": target}
     if slices.prioritised:

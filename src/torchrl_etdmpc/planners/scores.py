@@ -14,7 +14,7 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 
 from torch import Tensor, nn
 
-from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
+from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance, lower_confidence_bound
 
 Depths = Literal["last", "all"]
 """How much of the return table a score reads."""
@@ -64,20 +64,6 @@ class FunctionScore(nn.Module):
     def forward(self, returns: Tensor) -> Tensor:
         """Calls the function."""
         return self.function(returns)
-
-
-def lower_confidence_bound(returns: Tensor, beta: float) -> Tensor:
-    """``mean - beta * sigma`` over the heads (thesis 3.4.3); beta < 0 is optimism.
-
-    Args:
-        returns (Tensor): return estimates, shape ``[..., F, V]``.
-        beta (float): weight of the standard deviation of the mean (thesis Eq. 3.3).
-
-    Returns:
-        Tensor: shape ``[...]``.
-    """
-    mean = ensemble_mean(returns)
-    return mean if beta == 0 else mean - beta * ensemble_variance(returns).sqrt()
 
 
 @dataclass(frozen=True)

@@ -107,15 +107,26 @@ def build_loss(
     Keyword Args:
         discount (float): gamma.
         ignore_termination (bool): whether to accept rows that terminate without a termination head.
+
+    Raises:
+        ValueError: if a setting is out of range, or is changed although this kind of values has no use for it.
     """
     path = config.extra_terms
     options: dict[str, Any] = {"discount": discount, "scale_tau": config.tau, "ignore_termination": ignore_termination}
     options["extra_terms"] = [] if path is None else own_code("loss.extra_terms", path)(world_model)
     elsewhere = ("slice_len", "tau", "discount", "extra_terms")
+    action_values = isinstance(world_model, ActionValueWorldModel)
+    unused = ("kl_direction", "value_beta") if action_values else ("squashed_entropy",)
+    for name in unused:
+        if getattr(config, name) != getattr(LossConfig, name):
+            raise ValueError(
+                f"loss.{name} has no effect with model.action_values={str(action_values).lower()}, got "
+                f"{getattr(config, name)}; leave it at {getattr(LossConfig, name)}."
+            )
     with named_settings("loss", config, scale_tau="tau"):
         if isinstance(world_model, ActionValueWorldModel):
-            return TDMPC2Loss(world_model, **options, **arguments(config, *elsewhere, "kl_direction"))
-        return EfficientTDMPCLoss(world_model, **options, **arguments(config, *elsewhere, "squashed_entropy"))
+            return TDMPC2Loss(world_model, **options, **arguments(config, *elsewhere, *unused))
+        return EfficientTDMPCLoss(world_model, **options, **arguments(config, *elsewhere, *unused))
 
 
 def build_planner(

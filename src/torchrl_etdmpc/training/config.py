@@ -112,6 +112,9 @@ class LossConfig:
     """Weight of predicting the reward."""
     value_coef: float = 0.1
     """Weight of the values' error."""
+    value_beta: float = 0.0
+    """Pessimism of the value targets: the weight of the standard deviation over dynamics and value heads. Not of action
+    values, whose targets are the least of two heads."""
     termination_coef: float = 1.0
     """Weight of predicting the end of an episode, where there is a termination head."""
     entropy_coef: float = 1e-4
