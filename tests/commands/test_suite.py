@@ -106,6 +106,16 @@ def test_seeds_are_how_many_or_which(call, mine, asked, seeds):
     assert [int(word.removeprefix("seed=")) for line in planned for word in line.split() if "seed=" in word] == seeds
 
 
+@pytest.mark.parametrize("tasks", ["reacher-easy,cup-catch", "[reacher-easy,cup-catch]", "[reacher-easy, cup-catch]"])
+@pytest.mark.parametrize("variants", ["b,a", "[b, a]"])
+def test_tasks_and_variants_are_lists_with_or_without_brackets(call, mine, tasks, variants):
+    message, out = call(f"experiment={mine()}", "dry_run=true", f"tasks={tasks}", f"variants={variants}", "seeds=1")
+    assert message is None
+    planned = [line for line in out.splitlines() if line.startswith("python ")]
+    for part in ("task=reacher-easy", "task=cup-catch", "/a/", "/b/"):
+        assert sum(part in line for line in planned) == 2
+
+
 def test_a_dry_run_says_what_would_be_run_and_changes_nothing(call, mine, tmp_path):
     message, out = call(f"experiment={mine()}", "dry_run=true", "runs_dir=here")
     assert message is None

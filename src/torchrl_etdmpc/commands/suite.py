@@ -71,7 +71,7 @@ class SuiteConfig:
     runs_dir: str | None = None
     """Folder of the experiment's runs. Default: runs/EXPERIMENT."""
     tasks: str | None = None
-    """Tasks or sets of tasks, with commas between, instead of the experiment's."""
+    """Tasks or sets of tasks, "walker-walk,cup-catch" or "[walker-walk, cup-catch]", instead of the experiment's."""
     seeds: str | None = None
     """How many, or which ("7,8", and "[7]" where it is one), instead of the experiment's."""
     variants: str | None = None
@@ -210,7 +210,7 @@ def _import_own_code(config: SuiteConfig, settings: dict[str, Any], experiments:
         if isinstance(value, str):
             follow_own_code(name, value)
     tasks = {task: experiment for experiment in experiments for task in experiment.tasks}
-    for path in (path for path in f"{config.tasks or ''},{config.code or ''}".split(",") if ":" in path):
+    for path in (path for path in (*_listed(config.tasks), *_listed(config.code)) if ":" in path):
         if path in tasks:
             told = {**tasks[path].settings, **settings}
             names = {name: told.get(f"task.{name}", told.get(name)) for name in TASK_SETTINGS}
@@ -262,17 +262,28 @@ def _value(text: str) -> Any:
     return text
 
 
+def _listed(text: str | None) -> list[str]:
+    """The entries of a list, in brackets or not.
+
+    >>> _listed("walker-walk,cup-catch"), _listed("[walker-walk, cup-catch]"), _listed(None)
+    (['walker-walk', 'cup-catch'], ['walker-walk', 'cup-catch'], [])
+    """
+    text = (text or "").strip()
+    text = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+    return [entry.strip() for entry in text.split(",")] if text else []
+
+
 def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
     changes: dict[str, Any] = {"settings": settings}
     if config.tasks:
-        changes["tasks"] = config.tasks.split(",")
+        changes["tasks"] = _listed(config.tasks)
     if config.seeds:
-        seeds = [_value(seed) for seed in config.seeds.strip("[]").split(",")]
+        seeds = [_value(seed) for seed in _listed(config.seeds)]
         changes["seeds"] = seeds if "," in config.seeds or config.seeds.startswith("[") else seeds[0]
     experiment = read_experiment(find_experiment(config.experiment, EXPERIMENTS), **changes)
     if not config.variants:
         return experiment
-    chosen, known = config.variants.split(","), [*experiment.variants, *experiment.searches]
+    chosen, known = _listed(config.variants), [*experiment.variants, *experiment.searches]
     for name in chosen:
         if name not in known:
             raise ValueError(f"variants must be some of {', '.join(known)}, got {name!r}.")
