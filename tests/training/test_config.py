@@ -115,6 +115,7 @@ UTD4 = {
     "optim.lr": 3e-4,
     "optim.encoder_lr_scale": 0.3,
     "optim.grad_clip_norm": 20.0,
+    "optim.lr_halved_after": None,
     "optim.average_decay": 0.0,
     "replay.capacity": 1_000_000,
     "replay.insertion": "step",

@@ -482,6 +482,54 @@ def test_without_an_average_the_model_that_is_trained_acts():
         Updater(updater.loss, average_decay=1.0)
 
 
+def test_learning_rates_fall_with_the_updates_and_go_on():
+    def make() -> Updater:
+        return Updater(
+            EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True),
+            lr=0.01,
+            encoder_lr_scale=0.3,
+            lr_halved_after=2,
+        )
+
+    def rates(updater: Updater) -> list[float]:
+        return [group["lr"] for group in updater.optimizer.param_groups]
+
+    updater = make()
+    for updates, rate in enumerate((0.01, 0.01 / 1.5, 0.005, 0.004)):
+        assert rates(updater) == pytest.approx([0.3 * rate, rate, rate])
+        if updates == 3:
+            break
+        seeded_step(updater, make_batch(), seed=updates)
+    again = make()
+    again.load_state_dict(updater.state_dict())
+    assert rates(again) == rates(updater)
+    for one in (updater, again):
+        seeded_step(one, make_batch(), seed=9)
+    assert rates(again) == rates(updater) == pytest.approx([0.3 * 0.01 / 3, 0.01 / 3, 0.01 / 3])
+
+
+def test_the_first_update_has_the_whole_rate_and_the_second_a_smaller_one():
+    world_model, batch = make_world_model(), make_batch()
+    steady, falling = (
+        Updater(
+            EfficientTDMPCLoss(copy.deepcopy(world_model), discount=0.9, ignore_termination=True), lr_halved_after=after
+        )
+        for after in (None, 1)
+    )
+    falling.loss.target_value_params.update_(steady.loss.target_value_params)
+    for same in (True, False):
+        for updater in (steady, falling):
+            seeded_step(updater, batch.clone())
+        first, second = (updater.loss.world_model.parameters() for updater in (steady, falling))
+        assert all(map(torch.equal, first, second)) == same
+
+
+@pytest.mark.parametrize("after", [0, -3.0, float("nan")])
+def test_a_schedule_that_makes_no_sense_is_refused(after):
+    with pytest.raises(ValueError, match=r"^lr_halved_after must be positive or None, got "):
+        Updater(EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True), lr_halved_after=after)
+
+
 def test_the_caller_s_batch_is_left_as_it_is():
     batch = make_batch()
     before = batch.clone()

@@ -141,6 +141,7 @@ class OptimConfig:
     """The UTD ratio: model, value and policy updates per decision step."""
     lr: float = 3e-4
     encoder_lr_scale: float = 0.3
+    lr_halved_after: float | None = None
     grad_clip_norm: float = 20.0
     average_decay: float = 0.0
 
@@ -347,7 +348,7 @@ def arguments(group: Any, *without: str) -> dict[str, Any]:
     """A group's settings as keyword arguments, but for those that belong elsewhere.
 
     >>> arguments(OptimConfig(), "batch_size", "updates_per_decision")
-    {'lr': 0.0003, 'encoder_lr_scale': 0.3, 'grad_clip_norm': 20.0, 'average_decay': 0.0}
+    {'lr': 0.0003, 'encoder_lr_scale': 0.3, 'lr_halved_after': None, 'grad_clip_norm': 20.0, 'average_decay': 0.0}
     """
     values = dataclasses.asdict(group)
     for name in without:

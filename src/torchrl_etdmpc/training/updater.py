@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.objectives import LatentRolloutLoss, Slices
@@ -45,6 +46,8 @@ class Updater:
         encoder_lr_scale (float): factor of the encoder's learning rate. Default: 0.3.
         grad_clip_norm (float): largest gradient norm of the model and of the policy. Default: 20.
         tau (float): rate of the target values. Default: 0.01.
+        lr_halved_after (float, optional): updates after which the learning rates are half, after twice as many a third
+            and so on: ``lr / (1 + updates / lr_halved_after)``. Not in the thesis. Default: ``None``, constant rates.
         average_decay (float): of averaged weights to plan with, per update; below 1. Not in the thesis. Default: 0,
             no average.
         compile_mode (str, optional): ``torch.compile`` mode of loss and clipped gradient, one graph. Default: ``None``,
@@ -73,12 +76,15 @@ class Updater:
         encoder_lr_scale: float = 0.3,
         grad_clip_norm: float = 20.0,
         tau: float = 0.01,
+        lr_halved_after: float | None = None,
         average_decay: float = 0.0,
         compile_mode: str | None = None,
     ) -> None:
         for name, number in {"lr": lr, "grad_clip_norm": grad_clip_norm}.items():
             if not number > 0:
                 raise ValueError(f"{name} must be positive, got {number}.")
+        if lr_halved_after is not None and not lr_halved_after > 0:
+            raise ValueError(f"lr_halved_after must be positive or None, got {lr_halved_after}.")
         if not encoder_lr_scale >= 0:
             raise ValueError(f"encoder_lr_scale must not be negative, got {encoder_lr_scale}.")
         if not 0 <= tau <= 1:
@@ -111,6 +117,9 @@ class Updater:
             fused=True,
             capturable=device.type == "cuda",
         )
+        self._schedule = None
+        if lr_halved_after is not None:
+            self._schedule = LambdaLR(self.optimizer, lambda updates: 1 / (1 + updates / lr_halved_after))
         self.skipped = torch.zeros((), dtype=torch.int64, device=device)
         self.skipped_in_a_row = torch.zeros_like(self.skipped)
         self._compiled = None if compile_mode is None else compile_call(self._gradients, compile_mode, keep=False)
@@ -153,6 +162,8 @@ class Updater:
             self.optimizer.found_inf = not_finite  # pyright: ignore[reportAttributeAccessIssue]
             self.optimizer.step()
             self.optimizer.zero_grad()
+        if self._schedule is not None:
+            self._schedule.step()
         skipped = torch.stack(list(skip.values())).amax().long()
         self.skipped += skipped
         self.skipped_in_a_row.add_(1).mul_(skipped)
@@ -232,9 +243,11 @@ class Updater:
         return {part: _joined([next(every) for _ in self.parts[part]]) for part in parts}
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the optimiser, averaged weights, and the counts of skipped updates (the weights are the loss's)."""
+        """State of optimiser and rates, averaged weights, counts of skipped updates (the weights are the loss's)."""
         state: dict[str, Any] = {"optimizer": self.optimizer.state_dict()}
         state |= {"skipped": self.skipped.clone(), "skipped_in_a_row": self.skipped_in_a_row.clone()}
+        if self._schedule is not None:
+            state["schedule"] = {"updates": self._schedule.last_epoch}
         if self.average_decay:
             state["averaged"] = self.acting_model.state_dict()
         return state
@@ -244,6 +257,8 @@ class Updater:
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
+        if self._schedule is not None:
+            self._schedule.last_epoch = state_dict["schedule"]["updates"]
         if self.average_decay:
             self.acting_model.load_state_dict(state_dict["averaged"])
 
