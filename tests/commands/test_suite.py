@@ -106,6 +106,13 @@ def test_seeds_are_how_many_or_which(call, mine, asked, seeds):
     assert [int(word.removeprefix("seed=")) for line in planned for word in line.split() if "seed=" in word] == seeds
 
 
+@pytest.mark.parametrize("empty", ["tasks=[]", "variants=[]", "seeds=[]"])
+def test_an_empty_list_is_not_the_whole_experiment(call, mine, empty):
+    message, out = call(f"experiment={mine()}", "dry_run=true", empty)
+    assert str(message).startswith("error: ") and "\n" not in str(message)
+    assert out == ""
+
+
 @pytest.mark.parametrize("tasks", ["reacher-easy,cup-catch", "[reacher-easy,cup-catch]", "[reacher-easy, cup-catch]"])
 @pytest.mark.parametrize("variants", ["b,a", "[b, a]"])
 def test_tasks_and_variants_are_lists_with_or_without_brackets(call, mine, tasks, variants):

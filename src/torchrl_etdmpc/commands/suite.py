@@ -268,9 +268,11 @@ def _listed(text: str | None) -> list[str]:
     >>> _listed("walker-walk,cup-catch"), _listed("[walker-walk, cup-catch]"), _listed(None)
     (['walker-walk', 'cup-catch'], ['walker-walk', 'cup-catch'], [])
     """
-    text = (text or "").strip()
+    if not text:
+        return []
+    text = text.strip()
     text = text[1:-1] if text.startswith("[") and text.endswith("]") else text
-    return [entry.strip() for entry in text.split(",")] if text else []
+    return [entry.strip() for entry in text.split(",")]
 
 
 def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
