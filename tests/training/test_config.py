@@ -61,6 +61,7 @@ UTD4 = {
     "model.log_std_min": -3.0,
     "model.log_std_max": 1.0,
     "model.activation": "mish",
+    "model.normalize_observations": False,  # not in the thesis
     "model.action_values": False,
     "model.termination": None,  # DMC never terminates
     "planner.horizon": 6,

@@ -20,6 +20,7 @@ from torchrl_etdmpc.functional.mppi import (
     shift_plan,
 )
 from torchrl_etdmpc.functional.returns import discount_from_episode_length, return_table
+from torchrl_etdmpc.functional.running_moments import updated_moments
 from torchrl_etdmpc.functional.running_scale import updated_scale
 from torchrl_etdmpc.functional.simnorm import simnorm
 from torchrl_etdmpc.functional.two_hot import symexp, symlog, two_hot_cross_entropy, two_hot_decode, two_hot_encode
@@ -51,5 +52,6 @@ __all__ = [
     "two_hot_cross_entropy",
     "two_hot_decode",
     "two_hot_encode",
+    "updated_moments",
     "updated_scale",
 ]

@@ -7,6 +7,7 @@ from torchrl_etdmpc.modules.heads import ActionValueEnsemble, RewardHead, Termin
 from torchrl_etdmpc.modules.normed_linear import MLP, Activation, EnsembleLinear, NormedLinear
 from torchrl_etdmpc.modules.policy import GaussianPolicy, SquashedGaussianPolicy
 from torchrl_etdmpc.modules.prediction import ActionValueModel, PolicyModel, PredictionModel, device_and_dtype
+from torchrl_etdmpc.modules.running_norm import RunningNorm
 from torchrl_etdmpc.modules.world_model import WorldModel
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "PolicyModel",
     "PredictionModel",
     "RewardHead",
+    "RunningNorm",
     "SquashedGaussianPolicy",
     "TerminationHead",
     "ValueEnsemble",

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import simnorm
 from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
+from torchrl_etdmpc.modules.running_norm import RunningNorm
 
 
 class Encoder(LayerStack):
@@ -21,6 +22,8 @@ class Encoder(LayerStack):
         num_layers (int): number of hidden layers.
         simnorm_dim (int): group size of SimNorm.
         activation (str): of the hidden layers.
+        normalize (bool): whether observations are standardised first, by a
+            :class:`~torchrl_etdmpc.modules.RunningNorm`. Default: ``False``.
 
     Raises:
         TypeError: if an observation has another dtype than the weights.
@@ -38,6 +41,7 @@ class Encoder(LayerStack):
         num_layers: int = 1,
         simnorm_dim: int = 8,
         activation: Activation = "mish",
+        normalize: bool = False,
     ) -> None:
         super().__init__(
             observation_dim,
@@ -46,6 +50,21 @@ class Encoder(LayerStack):
             activation=activation,
             output_activation=partial(simnorm, group_size=simnorm_dim),
         )
+        self.norm = RunningNorm(observation_dim) if normalize else None
+
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights in every layer, and forgets the observations' statistics."""
+        super().reset_parameters_recursive()
+        if self.norm is not None:
+            self.norm.reset_parameters()
+
+    def observe(self, observation: Tensor) -> None:
+        """Moves the statistics that observations ``[..., O]`` are standardised by, if they are.
+
+        The losses call it in training mode with every batch, before they encode it.
+        """
+        if self.norm is not None:
+            self.norm.observe(observation)
 
     def forward(self, observation: Tensor) -> Tensor:
         """``[..., O] -> [..., L]``."""
@@ -55,4 +74,4 @@ class Encoder(LayerStack):
                 f"observations are {observation.dtype} and the weights {dtype}; append torchrl.envs.DoubleToFloat() to "
                 "the environment, or cast one of the two with .to(dtype)."
             )
-        return self.through(observation)
+        return self.through(observation if self.norm is None else self.norm(observation))

@@ -43,6 +43,8 @@ class WorldModel(nn.Module):
         log_std_max (float): largest log standard deviation of the policy.
         activation (str): ``"mish"``, ``"silu"`` or ``"relu"``.
         termination (bool): whether to build a termination head. Default: ``False`` (DMC never terminates).
+        normalize_observations (bool): whether observations are standardised by their running mean and variance, which
+            the losses move in training mode (:class:`~torchrl_etdmpc.modules.RunningNorm`). Default: ``False``.
         encoder (nn.Module, optional): an encoder of one's own, which owns its input: from whatever the observation is,
             with any leading batch, to the latent ``[..., L]``. The predictions are in the range of SimNorm (groups of
             ``simnorm_dim`` that sum to 1), so the encoder should end with it. Default: an
@@ -81,6 +83,7 @@ class WorldModel(nn.Module):
         log_std_max: float = 1.0,
         activation: Activation = "mish",
         termination: bool = False,
+        normalize_observations: bool = False,
         encoder: nn.Module | None = None,
     ) -> None:
         super().__init__()
@@ -127,8 +130,14 @@ class WorldModel(nn.Module):
                 num_layers=encoder_layers,
                 simnorm_dim=simnorm_dim,
                 activation=activation,
+                normalize=normalize_observations,
             )
         else:
+            if normalize_observations:
+                raise ValueError(
+                    "normalize_observations is for the encoder that is built here; put a RunningNorm into your own, "
+                    "and a method observe(observation) that moves it."
+                )
             _refuse_training_mode(encoder)
         self.encoder = encoder
         self.dynamics = DynamicsEnsemble(

@@ -496,7 +496,8 @@ class LatentRolloutLoss(LossModule):
             held: Any = self._modules.get(f"{name}_params")
             if held is None:
                 continue
-            network, first = getattr(self.world_model, attribute), _first(held)
+            # A network may begin with buffers.
+            network, first = getattr(self.world_model, attribute), _first(held, nn.Parameter)
             now = next(network.parameters())
             if self._trained.get(name, (None,))[0] is not first:
                 own = (value for value in held.values(True, True) if isinstance(value, nn.Parameter))
@@ -616,6 +617,10 @@ class LatentRolloutLoss(LossModule):
             dict: ``loss_*`` terms weighted by their coefficients, and detached metrics; with weights also the
             priorities ``[B, T]``, which :meth:`write_priority` takes out.
         """
+        if self.training and "encoder_params" in self._modules:  # who trains an encoder moves its statistics, too
+            observe = getattr(self.world_model.encoder, "observe", None)
+            if observe is not None:
+                observe(slices.observation)  # the first of each slice: what lies beyond an end is not among them
         rollout = latent_rollout(self.world_model, slices)._replace(targets=targets)
         losses, metrics = {}, {}
         for term in self.active_terms:
@@ -642,8 +647,8 @@ class LatentRolloutLoss(LossModule):
         return error * powers.unsqueeze(-1)
 
 
-def _first(params: Any) -> Tensor:
-    return next(iter(params.values(True, True)))
+def _first(params: Any, kind: type[Tensor] = Tensor) -> Tensor:
+    return next(value for value in params.values(True, True) if isinstance(value, kind))
 
 
 def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:

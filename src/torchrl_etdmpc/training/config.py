@@ -47,6 +47,8 @@ class ModelConfig:
     log_std_min: float = -3.0
     log_std_max: float = 1.0
     activation: Activation = "mish"
+    normalize_observations: bool = False
+    """Whether observations are standardised by their running mean and variance. Not in the thesis."""
     action_values: bool = False
     """Whether the value heads read the action too, as in TD-MPC2: the policy then maximises them, its actions squashed
     by a tanh, and learns nothing from plans."""

@@ -1,0 +1,34 @@
+"""The running mean and variance by which observations are standardised."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def updated_moments(mean: Tensor, variance: Tensor, rows: Tensor, rate: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Moves a running mean and variance towards those of some rows.
+
+    What results are the moments of a mixture, ``1 - rate`` of what was seen before and ``rate`` of the rows: with
+    ``rate = 1 / n`` at the n-th batch of equal size those of all batches together (Chan et al., 1979).
+
+    Args:
+        mean (Tensor): present mean, ``[O]``.
+        variance (Tensor): present variance, of a whole population, ``[O]``.
+        rows (Tensor): ``[..., O]``.
+        rate (float or Tensor): weight of the rows, in [0, 1].
+
+    Returns:
+        tuple of Tensor: mean and variance, each ``[O]``, without gradient; the present ones where rows are not finite.
+
+    >>> mean, variance = updated_moments(torch.zeros(1), torch.ones(1), torch.tensor([[2.0], [4.0]]), rate=0.5)
+    >>> mean.item(), variance.item()  # half of it at 0 with a variance of 1, half at 3 with a variance of 1
+    (1.5, 3.25)
+    """
+    rows = rows.detach().reshape(-1, rows.shape[-1]).to(mean.dtype)
+    rows_mean = rows.mean(0)
+    apart = rows_mean - mean
+    within = (1 - rate) * variance + rate * (rows - rows_mean).square().mean(0)
+    mixed = within + rate * (1 - rate) * apart.square()
+    finite = mixed.isfinite().all()
+    return torch.where(finite, mean + rate * apart, mean), torch.where(finite, mixed, variance)
