@@ -303,7 +303,6 @@ def _plain_errors(
     *,
     discount: float = 0.9,
     value_beta: float = 0.0,
-    value_correction: float = 0.0,
     kl_direction: str = "backward",
 ) -> dict[str, Tensor]:
     """Unweighted errors ``[B, T]`` with gradient, without dropout.
@@ -314,7 +313,6 @@ def _plain_errors(
         noise (Tensor): the policy's noise in the value targets, ``[T, B, A]``.
         discount (float): of the value targets.
         value_beta (float): as in the loss.
-        value_correction (float): as in the loss.
         kl_direction (str): as in the loss.
     """
     world_model = loss.world_model
@@ -345,20 +343,6 @@ def _plain_errors(
         low, high = world_model.policy.log_std_bounds
         return torch.tanh(out[..., :size]), torch.exp(low + (high - low) * (torch.tanh(out[..., size:]) + 1) / 2)
 
-    def value_of(latent: Tensor, head: int) -> Tensor:
-        return _expected(_network(target_values, latent, hidden=2, member=head), bins)
-
-    def futures_of(latent: Tensor, action: Tensor) -> list[Tensor]:
-        """The target value of what each dynamics head imagines, by each value head."""
-        futures = []
-        for i in range(num_dynamics):
-            imagined = step(i, latent, action)
-            alive = 1.0
-            if "termination_head" in weights:
-                alive = 1 - 1 / (1 + torch.exp(-termination_logit(imagined)))
-            futures += [alive * value_of(imagined, j) for j in range(num_values)]
-        return futures
-
     encoded = [encode(slices["observation"][:, 0])]
     encoded += [encode(slices["next", "observation"][:, k]).detach() for k in range(steps)]
     rollouts = []
@@ -374,19 +358,19 @@ def _plain_errors(
         with torch.no_grad():
             mean, std = policy(encoded[k])
             imagined_action = torch.clip(mean + std * noise[k], -1, 1)
-            futures = futures_of(encoded[k], imagined_action)
+            futures = []
+            for i in range(num_dynamics):
+                imagined = step(i, encoded[k], imagined_action)
+                alive = 1.0
+                if "termination_head" in weights:
+                    alive = 1 - 1 / (1 + torch.exp(-termination_logit(imagined)))
+                for j in range(num_values):
+                    value = _expected(_network(target_values, imagined, hidden=2, member=j), bins)
+                    futures.append(alive * value)
             future = torch.stack(futures).mean(0)
             if value_beta:
                 future = future - value_beta * torch.stack(futures).std(0) / math.sqrt(len(futures))
             target = _expected(reward_logits(encoded[k], imagined_action), bins) + discount * future
-            if value_correction:
-                expected = _expected(reward_logits(encoded[k], action), bins)
-                expected = expected + discount * torch.stack(futures_of(encoded[k], action)).mean(0)
-                bootstrap = torch.stack([value_of(encoded[k + 1], j) for j in range(num_values)]).mean(0)
-                if "termination_head" in weights:
-                    bootstrap = bootstrap * ~slices["next", "terminated"][:, k, 0]
-                happened = slices["next", "reward"][:, k, 0] + discount * bootstrap
-                target = target + value_correction * (happened - expected)
         here: dict[str, list[Tensor]] = {}
         for i in range(num_dynamics):
             latent, successor = rollouts[i][k], rollouts[i][k + 1]

@@ -104,7 +104,6 @@ UTD4 = {
     "loss.reward_coef": 0.1,
     "loss.value_coef": 0.1,
     "loss.value_beta": 0.0,
-    "loss.value_correction": 0.0,  # not in the thesis
     "loss.termination_coef": 1.0,
     "loss.entropy_coef": 1e-4,
     "loss.kl_direction": "backward",

@@ -7,14 +7,7 @@ from torchrl_etdmpc.objectives.max_q import PolicyValue, policy_value
 from torchrl_etdmpc.objectives.policy import EfficientTDMPCPolicyLoss, KLDirection, distillation
 from torchrl_etdmpc.objectives.tdmpc2 import TDMPC2Loss
 from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term, TermFunction
-from torchrl_etdmpc.objectives.value import (
-    EfficientTDMPCValueLoss,
-    Transition,
-    imagined_value_target,
-    model_error,
-    td_error,
-    value_error,
-)
+from torchrl_etdmpc.objectives.value import EfficientTDMPCValueLoss, imagined_value_target, td_error, value_error
 from torchrl_etdmpc.objectives.world_model import (
     EfficientTDMPCModelLoss,
     consistency_error,
@@ -34,7 +27,6 @@ __all__ = [
     "Reduction",
     "Slices",
     "TDMPC2Loss",
-    "Transition",
     "Term",
     "TermFunction",
     "action_td_error",
@@ -43,7 +35,6 @@ __all__ = [
     "consistency_error",
     "distillation",
     "imagined_value_target",
-    "model_error",
     "latent_rollout",
     "policy_value",
     "reward_error",

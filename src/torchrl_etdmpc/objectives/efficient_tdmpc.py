@@ -30,8 +30,6 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         value_coef (float): Default: 0.1.
         value_beta (float): pessimism of the value targets, the weight of the ensemble's standard deviation, not
             negative. Default: 0, the mean.
-        value_correction (float): weight of what the replayed transitions say against the model in the value targets
-            (:func:`~torchrl_etdmpc.objectives.model_error`), in [0, 1]. Not in the thesis. Default: 0.
         termination_coef (float): used with a termination head. Default: 1.
         policy_coef (float): Default: 1.
         entropy_coef (float): Default: 1e-4.
@@ -69,7 +67,6 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         reward_coef: float = 0.1,
         value_coef: float = 0.1,
         value_beta: float = 0.0,
-        value_correction: float = 0.0,
         termination_coef: float = 1.0,
         policy_coef: float = 1.0,
         entropy_coef: float = 1e-4,
@@ -90,14 +87,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
                     reward_coef=reward_coef,
                     termination_coef=termination_coef,
                 ),
-                value_term(
-                    self,
-                    world_model,
-                    value_coef=value_coef,
-                    value_beta=value_beta,
-                    value_correction=value_correction,
-                    discount=discount,
-                ),
+                value_term(self, world_model, value_coef=value_coef, value_beta=value_beta, discount=discount),
                 policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),
             ],
             extra_terms=extra_terms,

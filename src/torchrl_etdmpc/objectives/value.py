@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,25 +15,6 @@ from torchrl_etdmpc.functional import lower_confidence_bound, two_hot_cross_entr
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term
-
-
-class Transition(NamedTuple):
-    """Replayed steps, in latent space.
-
-    >>> Transition(torch.zeros(4, 16), torch.zeros(4, 2), torch.zeros(4), torch.zeros(4, 16)).terminated is None
-    True
-    """
-
-    latent: Tensor
-    """Encoded z, ``[..., L]``."""
-    action: Tensor
-    """The action that was taken, ``[..., A]``."""
-    reward: Tensor
-    """``[...]``"""
-    following: Tensor
-    """Encoded z', ``[..., L]``."""
-    terminated: Tensor | None = None
-    """Whether z' is terminal, bool ``[...]``. ``None``: never."""
 
 
 @torch.no_grad()
@@ -75,49 +56,6 @@ def imagined_value_target(
     if ended is not None:
         bootstrap = bootstrap * (1 - ended).unsqueeze(-1)
     return world_model.reward(latent, action) + discount * lower_confidence_bound(bootstrap.movedim(0, -2), beta)
-
-
-@torch.no_grad()
-def model_error(
-    world_model: WorldModel,
-    target_values: Callable[[Tensor], Tensor],
-    transition: Transition,
-    discount: float | Tensor,
-) -> Tensor:
-    """How much more a replayed transition is worth than the model imagines it to be.
-
-    ``e = r + gamma (1 - d) mean_j Vbar_j(z') - [R(z, a) + gamma mean_{i,j} (1 - p(f_i(z, a))) Vbar_j(f_i(z, a))]``
-
-    Added to :func:`imagined_value_target` it makes the target doubly robust (Jiang and Li, arXiv:1511.03722, with a
-    ratio of 1): the transition says what happened, and the model only what the policy's action changes about it. An
-    error that the model makes in a state whatever the action cancels. Without it a model that is wrong by a hundredth
-    of the value, always to the same side, keeps a value up that nothing pays for: the discount takes a hundredth per
-    step.
-
-    Args:
-        world_model (WorldModel): reward and dynamics.
-        target_values (callable): the target value heads, latents ``[..., L]`` to values ``[..., V]``.
-        transition (Transition): replayed steps.
-        discount (float or Tensor): gamma.
-
-    Returns:
-        Tensor: in the units of the return, without gradient, shape ``[...]``.
-
-    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)  # rewards and values are 0 before training
-    >>> latent = world_model.encode(torch.zeros(4, 3))
-    >>> transition = Transition(latent, torch.zeros(4, 2), torch.ones(4), latent, torch.zeros(4, dtype=torch.bool))
-    >>> model_error(world_model, world_model.values, transition, 0.99).tolist()
-    [1.0, 1.0, 1.0, 1.0]
-    """
-    latent, action, reward, following, terminated = transition
-    imagined = world_model.next(latent.unsqueeze(0), action)
-    expected, happened = target_values(imagined).mean(-1), target_values(following).mean(-1)
-    ended = world_model.termination(imagined)
-    if ended is not None:
-        expected = expected * (1 - ended)
-    if terminated is not None:
-        happened = torch.where(terminated, 0, happened)
-    return reward - world_model.reward(latent, action) + discount * (happened - expected.mean(0))
 
 
 def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor, *, dropout: bool) -> Tensor:
@@ -179,8 +117,6 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         value_coef (float): weight of the term. Default: 0.1.
         value_beta (float): pessimism of the targets, the weight of the ensemble's standard deviation, not negative.
             Default: 0, the mean.
-        value_correction (float): weight of what the replayed transitions say against the model
-            (:func:`model_error`), in [0, 1]. Default: 0, the model alone is asked.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
@@ -205,15 +141,13 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         discount: float,
         value_coef: float = 0.1,
         value_beta: float = 0.0,
-        value_correction: float = 0.0,
         rho: float = 0.5,
         ignore_termination: bool = False,
         reduction: Reduction | None = None,
     ) -> None:
-        options: Any = {"value_coef": value_coef, "value_beta": value_beta, "value_correction": value_correction}
         super().__init__(
             world_model,
-            [value_term(self, world_model, discount=discount, **options)],
+            [value_term(self, world_model, value_coef=value_coef, value_beta=value_beta, discount=discount)],
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,
@@ -221,19 +155,13 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
 
 
 def value_term(
-    loss: LatentRolloutLoss,
-    world_model: WorldModel,
-    *,
-    value_coef: float,
-    value_beta: float,
-    value_correction: float,
-    discount: float,
+    loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: float, value_beta: float, discount: float
 ) -> Term:
     """The term of the value heads, for any loss.
 
     Raises:
         TypeError: if the value heads read actions.
-        ValueError: if the discount, ``value_beta`` or ``value_correction`` is out of range.
+        ValueError: if the discount or ``value_beta`` is out of range.
     """
     if isinstance(world_model, ActionValueWorldModel):
         raise TypeError(
@@ -244,28 +172,19 @@ def value_term(
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
     if not 0 <= value_beta < math.inf:
         raise ValueError(f"value_beta must be finite and not negative, got {value_beta}; 0 is the mean of the heads.")
-    if not 0 <= value_correction <= 1:
-        raise ValueError(f"value_correction must be in [0, 1], got {value_correction}.")
-    happened = ("reward",) if world_model.termination_head is None else ("reward", "terminated")
     return Term(
         "value",
-        partial(_value, loss, value_beta, value_correction),
+        partial(_value, loss, value_beta),
         value_coef,
         networks=("encoder", "dynamics", "value"),
         targets=("value",),
-        keys=happened if value_correction else (),
         metrics=("value_error", "value_target"),
         scalars={"discount": discount},
     )
 
 
 def _value(
-    loss: LatentRolloutLoss,
-    value_beta: float,
-    value_correction: float,
-    world_model: WorldModel,
-    slices: Slices,
-    rollout: LatentRollout,
+    loss: LatentRolloutLoss, value_beta: float, world_model: WorldModel, slices: Slices, rollout: LatentRollout
 ) -> tuple[Tensor, dict[str, Tensor]]:
     targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
 
@@ -277,11 +196,6 @@ def _value(
     target = imagined_value_target(
         world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount, value_beta
     )
-    if value_correction:
-        assert slices.reward is not None
-        terminated = None if world_model.termination_head is None else slices.terminated
-        happened = Transition(rollout.encoded[:-1], slices.action, slices.reward, rollout.encoded[1:], terminated)
-        target = target + value_correction * model_error(world_model, values, happened, loss.discount)
     metrics = {"value_target": target}
     if slices.prioritised:
         metrics[PRIORITY] = td_error(world_model, rollout, target)

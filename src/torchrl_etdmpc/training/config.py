@@ -117,9 +117,6 @@ class LossConfig:
     value_beta: float = 0.0
     """Pessimism of the value targets: the weight of the standard deviation over dynamics and value heads. Not of action
     values, whose targets are the least of two heads."""
-    value_correction: float = 0.0
-    """How much replayed transitions correct what the model imagines in the value targets, from 0 to 1. Not in the
-    thesis, and not of action values, which learn from replayed transitions alone."""
     termination_coef: float = 1.0
     """Weight of predicting the end of an episode, where there is a termination head."""
     entropy_coef: float = 1e-4
