@@ -19,7 +19,7 @@ from torchrl_etdmpc.functional.mppi import (
     select_elites,
     shift_plan,
 )
-from torchrl_etdmpc.functional.returns import discount_from_episode_length, return_table
+from torchrl_etdmpc.functional.returns import bootstrapped_returns, discount_from_episode_length, return_table
 from torchrl_etdmpc.functional.running_moments import updated_moments
 from torchrl_etdmpc.functional.running_scale import updated_scale
 from torchrl_etdmpc.functional.simnorm import simnorm
@@ -30,6 +30,7 @@ __all__ = [
     "Elites",
     "Gaussian",
     "adaptive_mixture",
+    "bootstrapped_returns",
     "bounded_log_std",
     "clipped_sample",
     "discount_from_episode_length",

@@ -44,6 +44,45 @@ def return_table(rewards: Tensor, values: Tensor, discount: float | Tensor, aliv
     return rewards.cumsum(-2)[..., horizon - depths :, :, None] + values
 
 
+def bootstrapped_returns(
+    rewards: Tensor,
+    values: Tensor,
+    discount: float | Tensor,
+    *,
+    terminated: Tensor | None = None,
+    counts: Tensor | None = None,
+) -> Tensor:
+    """What is paid in the rest of a slice, and what the state at its end is worth, from each of its steps on.
+
+    ``G_k = r_k + gamma (1 - d_k) G_{k+1}``, with ``G_T = V(s_T)``: from step k on the n-step return of all the steps
+    that are left.
+
+    Args:
+        rewards (Tensor): of T steps, time first, shape ``[T, ...]``.
+        values (Tensor): of the states that the steps lead to, ``[T, ...]``.
+        discount (float or Tensor): gamma, a scalar.
+        terminated (Tensor, optional): whether a step led to a terminal state, which is worth nothing, bool
+            ``[T, ...]``. Default: none did.
+        counts (Tensor, optional): the steps that count, bool ``[T, ...]``, the first ones of their slice: the slice
+            ends with the last of them. Default: all of them.
+
+    Returns:
+        Tensor: ``[T, ...]``.
+
+    >>> bootstrapped_returns(torch.ones(3), torch.tensor([0.0, 0.0, 8.0]), 0.5).tolist()
+    [2.75, 3.5, 5.0]
+    """
+    following, returns = values[-1], []
+    for k in reversed(range(len(rewards))):
+        if counts is not None and k + 1 < len(rewards):
+            following = torch.where(counts[k + 1], following, values[k])
+        if terminated is not None:
+            following = torch.where(terminated[k], 0, following)
+        following = rewards[k] + discount * following
+        returns.append(following)
+    return torch.stack(returns[::-1])
+
+
 def discount_from_episode_length(
     decision_steps: float, *, discount_min: float = 0.95, discount_max: float = 0.995, denominator: float = 5.0
 ) -> float:

@@ -7,7 +7,13 @@ from torchrl_etdmpc.objectives.max_q import PolicyValue, policy_value
 from torchrl_etdmpc.objectives.policy import EfficientTDMPCPolicyLoss, KLDirection, distillation
 from torchrl_etdmpc.objectives.tdmpc2 import TDMPC2Loss
 from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term, TermFunction
-from torchrl_etdmpc.objectives.value import EfficientTDMPCValueLoss, imagined_value_target, td_error, value_error
+from torchrl_etdmpc.objectives.value import (
+    EfficientTDMPCValueLoss,
+    imagined_value_target,
+    replayed_value_target,
+    td_error,
+    value_error,
+)
 from torchrl_etdmpc.objectives.world_model import (
     EfficientTDMPCModelLoss,
     consistency_error,
@@ -37,6 +43,7 @@ __all__ = [
     "imagined_value_target",
     "latent_rollout",
     "policy_value",
+    "replayed_value_target",
     "reward_error",
     "td_error",
     "termination_error",

@@ -30,6 +30,9 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         value_coef (float): Default: 0.1.
         value_beta (float): pessimism of the value targets, the weight of the ensemble's standard deviation, not
             negative. Default: 0, the mean.
+        value_replayed (float): weight in the value targets of what was paid in the rest of the slice
+            (:func:`~torchrl_etdmpc.objectives.replayed_value_target`) beside what the model imagines, in [0, 1]. Not in
+            the thesis. Default: 0.
         termination_coef (float): used with a termination head. Default: 1.
         policy_coef (float): Default: 1.
         entropy_coef (float): Default: 1e-4.
@@ -67,6 +70,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         reward_coef: float = 0.1,
         value_coef: float = 0.1,
         value_beta: float = 0.0,
+        value_replayed: float = 0.0,
         termination_coef: float = 1.0,
         policy_coef: float = 1.0,
         entropy_coef: float = 1e-4,
@@ -87,7 +91,14 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
                     reward_coef=reward_coef,
                     termination_coef=termination_coef,
                 ),
-                value_term(self, world_model, value_coef=value_coef, value_beta=value_beta, discount=discount),
+                value_term(
+                    self,
+                    world_model,
+                    value_coef=value_coef,
+                    value_beta=value_beta,
+                    value_replayed=value_replayed,
+                    discount=discount,
+                ),
                 policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),
             ],
             extra_terms=extra_terms,

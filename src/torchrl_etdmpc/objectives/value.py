@@ -1,4 +1,4 @@
-"""The value loss: one-step imagined targets from encoded latents, read on every head's rollout."""
+"""The value loss: imagined and replayed targets, from encoded latents, read on every head's rollout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from torchrl_etdmpc.functional import lower_confidence_bound, two_hot_cross_entropy, two_hot_decode
+from torchrl_etdmpc.functional import (
+    bootstrapped_returns,
+    lower_confidence_bound,
+    two_hot_cross_entropy,
+    two_hot_decode,
+)
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term
@@ -56,6 +61,46 @@ def imagined_value_target(
     if ended is not None:
         bootstrap = bootstrap * (1 - ended).unsqueeze(-1)
     return world_model.reward(latent, action) + discount * lower_confidence_bound(bootstrap.movedim(0, -2), beta)
+
+
+@torch.no_grad()
+def replayed_value_target(
+    target_values: Callable[[Tensor], Tensor],
+    following: Tensor,
+    reward: Tensor,
+    discount: float | Tensor,
+    beta: float = 0.0,
+    *,
+    terminated: Tensor | None = None,
+    counts: Tensor | None = None,
+) -> Tensor:
+    """TD target of what was done and paid in the rest of a slice: n-step returns of the behaviour.
+
+    ``y_k = r_k + gamma r_{k+1} + ... + gamma^{T-k} mean_j Vbar_j(z_T)``. The model has no say in it, so it cannot keep
+    a value up that nothing pays for; what the planner does in a state is what the state is worth. It is the value of
+    the behaviour that is replayed, the present one's and those of before.
+
+    Args:
+        target_values (callable): the target value heads, latents ``[..., L]`` to values ``[..., V]``.
+        following (Tensor): encoded latents that the T steps lead to, ``[T, ..., L]``.
+        reward (Tensor): ``[T, ...]``.
+        discount (float or Tensor): gamma.
+        beta (float): as in :func:`imagined_value_target`, over the value heads. Default: 0.
+
+    Keyword Args:
+        terminated (Tensor, optional): whether a step led to a terminal state, bool ``[T, ...]``. Default: none did.
+        counts (Tensor, optional): the steps of the slice that count, bool ``[T, ...]``. Default: all of them.
+
+    Returns:
+        Tensor: targets in the units of the return, without gradient, ``[T, ...]``.
+
+    >>> world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32)  # values are 0 before training
+    >>> latents = world_model.encode(torch.zeros(3, 4, 3))
+    >>> replayed_value_target(world_model.values, latents, torch.ones(3, 4), 0.5)[:, 0].tolist()
+    [1.75, 1.5, 1.0]
+    """
+    values = lower_confidence_bound(target_values(following).unsqueeze(-2), beta)
+    return bootstrapped_returns(reward, values, discount, terminated=terminated, counts=counts)
 
 
 def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor, *, dropout: bool) -> Tensor:
@@ -104,7 +149,7 @@ def td_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor) ->
 
 
 class EfficientTDMPCValueLoss(LatentRolloutLoss):
-    """Value loss with one-step imagined targets (thesis Eq. 2.16; BMPC, arXiv:2503.18871).
+    """Value loss with one-step imagined targets (thesis Eq. 2.16; BMPC, arXiv:2503.18871), or with replayed ones.
 
     Trains the value heads, and encoder and dynamics through the rollout. The target heads are an exponential moving
     average: pass this loss to :class:`torchrl.objectives.SoftUpdate` (``tau=0.01``) and step it after every update.
@@ -117,6 +162,8 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         value_coef (float): weight of the term. Default: 0.1.
         value_beta (float): pessimism of the targets, the weight of the ensemble's standard deviation, not negative.
             Default: 0, the mean.
+        value_replayed (float): weight of :func:`replayed_value_target` beside :func:`imagined_value_target`, in
+            [0, 1]. Default: 0.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
@@ -141,13 +188,15 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         discount: float,
         value_coef: float = 0.1,
         value_beta: float = 0.0,
+        value_replayed: float = 0.0,
         rho: float = 0.5,
         ignore_termination: bool = False,
         reduction: Reduction | None = None,
     ) -> None:
+        options: Any = {"value_coef": value_coef, "value_beta": value_beta, "value_replayed": value_replayed}
         super().__init__(
             world_model,
-            [value_term(self, world_model, value_coef=value_coef, value_beta=value_beta, discount=discount)],
+            [value_term(self, world_model, discount=discount, **options)],
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,
@@ -155,13 +204,19 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
 
 
 def value_term(
-    loss: LatentRolloutLoss, world_model: WorldModel, *, value_coef: float, value_beta: float, discount: float
+    loss: LatentRolloutLoss,
+    world_model: WorldModel,
+    *,
+    value_coef: float,
+    value_beta: float,
+    value_replayed: float,
+    discount: float,
 ) -> Term:
     """The term of the value heads, for any loss.
 
     Raises:
         TypeError: if the value heads read actions.
-        ValueError: if the discount or ``value_beta`` is out of range.
+        ValueError: if the discount, ``value_beta`` or ``value_replayed`` is out of range.
     """
     if isinstance(world_model, ActionValueWorldModel):
         raise TypeError(
@@ -172,19 +227,28 @@ def value_term(
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
     if not 0 <= value_beta < math.inf:
         raise ValueError(f"value_beta must be finite and not negative, got {value_beta}; 0 is the mean of the heads.")
+    if not 0 <= value_replayed <= 1:
+        raise ValueError(f"value_replayed must be in [0, 1], got {value_replayed}.")
+    paid = ("reward",) if world_model.termination_head is None else ("reward", "terminated")
     return Term(
         "value",
-        partial(_value, loss, value_beta),
+        partial(_value, loss, value_beta, value_replayed),
         value_coef,
         networks=("encoder", "dynamics", "value"),
         targets=("value",),
+        keys=paid if value_replayed else (),
         metrics=("value_error", "value_target"),
         scalars={"discount": discount},
     )
 
 
 def _value(
-    loss: LatentRolloutLoss, value_beta: float, world_model: WorldModel, slices: Slices, rollout: LatentRollout
+    loss: LatentRolloutLoss,
+    value_beta: float,
+    value_replayed: float,
+    world_model: WorldModel,
+    slices: Slices,
+    rollout: LatentRollout,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
 
@@ -193,9 +257,17 @@ def _value(
         return two_hot_decode(logits, world_model.bins).movedim(0, -1)
 
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
-    target = imagined_value_target(
-        world_model, values, rollout.encoded[:-1], torch.randn_like(slices.action), loss.discount, value_beta
-    )
+    target = torch.zeros_like(rollout.encoded[:-1, :, 0])
+    if value_replayed < 1:
+        latent, noise = rollout.encoded[:-1], torch.randn_like(slices.action)
+        imagined = imagined_value_target(world_model, values, latent, noise, loss.discount, value_beta)
+        target = target + (1 - value_replayed) * imagined
+    if value_replayed:
+        assert slices.reward is not None
+        terminated = None if world_model.termination_head is None else slices.terminated
+        ends: Any = {"terminated": terminated, "counts": slices.counts}
+        paid = replayed_value_target(values, rollout.encoded[1:], slices.reward, loss.discount, value_beta, **ends)
+        target = target + value_replayed * paid
     metrics = {"value_target": target}
     if slices.prioritised:
         metrics[PRIORITY] = td_error(world_model, rollout, target)

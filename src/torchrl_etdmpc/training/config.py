@@ -117,6 +117,10 @@ class LossConfig:
     value_beta: float = 0.0
     """Pessimism of the value targets: the weight of the standard deviation over dynamics and value heads. Not of action
     values, whose targets are the least of two heads."""
+    value_replayed: float = 0.0
+    """How much of the value targets, from 0 to 1, is what was paid in the rest of the replayed slice, and not what the
+    model imagines of the next step. Not in the thesis, and not of action values, which learn from replayed steps
+    anyway."""
     termination_coef: float = 1.0
     """Weight of predicting the end of an episode, where there is a termination head."""
     entropy_coef: float = 1e-4
