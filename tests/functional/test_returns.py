@@ -4,8 +4,9 @@ import re
 
 import pytest
 import torch
+from torchrl.objectives.value.functional import td1_return_estimate
 
-from torchrl_etdmpc.functional import discount_from_episode_length, return_table
+from torchrl_etdmpc.functional import bootstrapped_returns, discount_from_episode_length, return_table
 
 
 def rollout(horizon: int, heads: int, values: int, *batch: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
@@ -178,3 +179,27 @@ def test_an_episode_without_steps_has_no_discount(steps):
     message = f"decision_steps must be positive, got {steps}; pass the episode length in decisions."
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         discount_from_episode_length(steps)
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_bootstrapped_returns_are_those_of_torchrl(ends):
+    generator = torch.Generator().manual_seed(3)
+    rewards, values = (torch.randn(6, 50, generator=generator, dtype=torch.float64) for _ in range(2))
+    terminated = (torch.rand(6, 50, generator=generator) < 0.2) & ends
+    done = terminated.clone()
+    done[-1] = True  # the slice ends there, and the values tell what is left
+    entries = (entry.T.unsqueeze(-1) for entry in (values, rewards, done, terminated))
+    expected = td1_return_estimate(0.9, *entries).squeeze(-1).T
+    torch.testing.assert_close(bootstrapped_returns(rewards, values, 0.9, terminated=terminated), expected)
+
+
+def test_bootstrapped_returns_of_one_step_are_reward_and_discounted_value():
+    torch.testing.assert_close(bootstrapped_returns(torch.ones(1), torch.ones(1), 0.25), torch.tensor([1.25]))
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4])
+def test_bootstrapped_returns_end_where_the_steps_cease_to_count(length):
+    rewards, values = torch.randn(2, 4, 5)
+    counts = (torch.arange(4) < length).unsqueeze(-1).expand(4, 5)
+    short = bootstrapped_returns(rewards[:length], values[:length], 0.9)
+    torch.testing.assert_close(bootstrapped_returns(rewards, values, 0.9, counts=counts)[:length], short)

@@ -303,6 +303,7 @@ def _plain_errors(
     *,
     discount: float = 0.9,
     value_beta: float = 0.0,
+    value_replayed: float = 0.0,
     kl_direction: str = "backward",
 ) -> dict[str, Tensor]:
     """Unweighted errors ``[B, T]`` with gradient, without dropout.
@@ -313,6 +314,7 @@ def _plain_errors(
         noise (Tensor): the policy's noise in the value targets, ``[T, B, A]``.
         discount (float): of the value targets.
         value_beta (float): as in the loss.
+        value_replayed (float): as in the loss.
         kl_direction (str): as in the loss.
     """
     world_model = loss.world_model
@@ -343,6 +345,19 @@ def _plain_errors(
         low, high = world_model.policy.log_std_bounds
         return torch.tanh(out[..., :size]), torch.exp(low + (high - low) * (torch.tanh(out[..., size:]) + 1) / 2)
 
+    def paid_from(k: int) -> Tensor:
+        """What was paid in the rest of the slice, and the worth of the state at its end."""
+        worth = torch.stack(
+            [_expected(_network(target_values, encoded[steps], hidden=2, member=j), bins) for j in range(num_values)]
+        )
+        total, alive = torch.zeros(len(slices)), torch.ones(len(slices))
+        for later in range(k, steps):
+            total = total + alive * discount ** (later - k) * slices["next", "reward"][:, later, 0]
+            if "termination_head" in weights:
+                alive = alive * ~slices["next", "terminated"][:, later, 0]
+        future = worth.mean(0) - value_beta * worth.std(0) / math.sqrt(num_values)
+        return total + alive * discount ** (steps - k) * future
+
     encoded = [encode(slices["observation"][:, 0])]
     encoded += [encode(slices["next", "observation"][:, k]).detach() for k in range(steps)]
     rollouts = []
@@ -371,6 +386,8 @@ def _plain_errors(
             if value_beta:
                 future = future - value_beta * torch.stack(futures).std(0) / math.sqrt(len(futures))
             target = _expected(reward_logits(encoded[k], imagined_action), bins) + discount * future
+            if value_replayed:
+                target = (1 - value_replayed) * target + value_replayed * paid_from(k)
         here: dict[str, list[Tensor]] = {}
         for i in range(num_dynamics):
             latent, successor = rollouts[i][k], rollouts[i][k + 1]

@@ -65,8 +65,7 @@ def test_the_loss_is_that_of_standardised_observations_without_the_option(make_w
 
 def test_what_lies_beyond_the_end_of_an_episode_is_not_counted_in(make_world_model, make_loss, make_slices):
     batch = make_slices()
-    batch["mask"] = torch.ones(batch.shape, dtype=torch.bool)
-    batch["mask"][:, 1:] = False
+    batch["collector", "mask"] = torch.arange(batch.shape[1]).expand(batch.shape) < 1
     batch["observation"][:, 1:] = 1e6
     batch["next", "observation"][:, 1:] = 1e6
     loss = make_loss("whole", make_world_model(normalize_observations=True))

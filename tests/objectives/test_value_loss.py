@@ -17,12 +17,22 @@ def _noise(slices, seed: int = 7):
 
 @pytest.mark.parametrize("kind", ["value", "whole"])
 @pytest.mark.parametrize("termination", [False, True])
-@pytest.mark.parametrize("value_beta", [0.0, 1.5])
+@pytest.mark.parametrize(("value_beta", "value_replayed"), [(0.0, 0.0), (1.5, 0.0), (0.0, 1.0), (1.5, 0.4)])
 def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step(
-    make_world_model, make_loss, slices, run_seeded, plain_errors, depth_mean, kind, termination, value_beta
+    make_world_model,
+    make_loss,
+    slices,
+    run_seeded,
+    plain_errors,
+    depth_mean,
+    kind,
+    termination,
+    value_beta,
+    value_replayed,
 ):
-    loss = make_loss(kind, make_world_model(termination=termination), value_beta=value_beta).eval()
-    errors = plain_errors(loss, slices, _noise(slices), value_beta=value_beta)
+    options = {"value_beta": value_beta, "value_replayed": value_replayed}
+    loss = make_loss(kind, make_world_model(termination=termination), **options).eval()
+    errors = plain_errors(loss, slices, _noise(slices), **options)
     out = run_seeded(loss, slices)
     torch.testing.assert_close(out["value_target"], errors["value_target"].mean())
     torch.testing.assert_close(out["value_error"], errors["value"].mean().detach())  # knows neither coefficient nor rho

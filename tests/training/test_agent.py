@@ -245,7 +245,12 @@ def test_every_planner_plans_with_the_averaged_weights_if_asked(tiny_agent):
 
 @pytest.mark.parametrize(
     ("action_values", "loss"),
-    [(True, {"value_beta": 1.0}), (True, {"kl_direction": "forward"}), (False, {"squashed_entropy": False})],
+    [
+        (True, {"value_beta": 1.0}),
+        (True, {"value_replayed": 1.0}),
+        (True, {"kl_direction": "forward"}),
+        (False, {"squashed_entropy": False}),
+    ],
 )
 def test_a_setting_that_the_kind_of_values_has_no_use_for_is_refused(tiny_agent, action_values, loss):
     (name,) = loss

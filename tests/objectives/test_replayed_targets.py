@@ -1,0 +1,100 @@
+"""Value targets that are what was paid in the rest of a replayed slice."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_etdmpc.objectives import imagined_value_target, replayed_value_target
+
+DISCOUNT = 0.99
+
+
+def test_a_slice_of_one_step_is_the_temporal_difference_of_what_happened():
+    target = replayed_value_target(
+        lambda z: torch.cat([10 * z, 14 * z], -1), torch.ones(1, 4, 1), torch.ones(1, 4), 0.5
+    )
+    assert target.tolist() == [[7.0] * 4]
+
+
+def test_a_beta_of_one_bootstraps_from_the_lesser_of_two_heads():
+    target = replayed_value_target(
+        lambda z: torch.cat([10 * z, 14 * z], -1), torch.ones(1, 4, 1), torch.ones(1, 4), 0.5, beta=1.0
+    )
+    torch.testing.assert_close(target, torch.full((1, 4), 6.0))
+
+
+class Optimistic:
+    """A model in which an agent that stands still comes closer with every step, by a hundredth of the value."""
+
+    def act(self, latent: Tensor, noise: Tensor) -> Tensor:
+        return torch.zeros_like(noise)
+
+    def next(self, latent: Tensor, action: Tensor) -> Tensor:
+        return latent + 1
+
+    def reward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return torch.zeros(latent.shape[:-1])
+
+    def termination(self, latent: Tensor) -> Tensor | None:
+        return None
+
+
+@pytest.mark.parametrize(("replayed", "left"), [(0.0, 137.0), (0.5, 0.0), (1.0, 0.0)])
+def test_a_value_that_nothing_pays_for_stays_where_it_is_imagined_alone_and_fades_otherwise(replayed, left):
+    value, here = torch.tensor(137.0), torch.zeros(3, 1, 1)
+    for _ in range(2000):
+        # What lies one imagined step ahead is worth a hundredth more than the state itself.
+        values = lambda latent, value=value: value * (1 + latent / 99)  # noqa: E731
+        imagined = imagined_value_target(Optimistic(), values, here[:1], torch.zeros(1, 1, 1), DISCOUNT)[0]
+        paid = replayed_value_target(values, here, torch.zeros(3, 1), DISCOUNT)[0]
+        value = ((1 - replayed) * imagined + replayed * paid)[0]
+    assert value.item() == pytest.approx(left, abs=0.05)
+
+
+def test_a_target_that_is_replayed_alone_is_the_same_whatever_the_model_and_the_policy_say(
+    make_world_model, make_loss, slices
+):
+    loss = make_loss("whole", make_world_model(), value_replayed=1.0).eval()
+    before = loss(slices)["value_target"]
+    with torch.no_grad():
+        for network in (loss.world_model.dynamics, loss.world_model.reward_head, loss.world_model.policy):
+            for parameter in network.parameters():
+                parameter.normal_()
+    assert loss(slices)["value_target"] == before
+
+
+def test_the_targets_have_no_gradient(make_world_model):
+    world_model = make_world_model()
+    latents = torch.rand(3, 7, 16, requires_grad=True)
+    assert not replayed_value_target(world_model.values, latents, torch.zeros(3, 7), DISCOUNT).requires_grad
+
+
+@pytest.mark.parametrize("termination", [False, True])
+def test_the_value_loss_reads_what_was_paid_only_if_it_counts(make_world_model, make_loss, slices, termination):
+    ends = [("next", "terminated")] if termination else []
+    for replayed, read in ((0.0, []), (0.5, [("next", "reward"), *ends])):
+        loss = make_loss("value", make_world_model(termination=termination), value_replayed=replayed)
+        assert loss.in_keys == ["observation", ("next", "observation"), "action", *read]
+        loss(slices.select(*loss.in_keys))
+
+
+def test_without_a_termination_head_the_targets_bootstrap_through_ends(make_world_model, make_loss, make_slices):
+    slices = make_slices()
+    loss = make_loss("whole", make_world_model(), value_replayed=1.0, ignore_termination=True)
+    targets = []
+    for flag in (False, True):
+        slices["next", "terminated"][:] = flag
+        targets.append(loss(slices)["value_target"])
+    assert torch.equal(*targets)
+
+
+def test_a_slice_that_ends_early_is_worth_what_its_last_counted_step_leads_to(make_world_model, make_loss, make_slices):
+    slices = make_slices(slice_len=4)
+    loss = make_loss("value", make_world_model(), value_replayed=1.0, reduction="none").eval()
+    short = loss(slices[:, :2])["value_target"]
+    slices["collector", "mask"] = torch.arange(4).expand(slices.shape) < 2
+    slices["next", "reward"][:, 2:] = 1e6
+    slices["next", "observation"][:, 2:] = 1e6
+    torch.testing.assert_close(loss(slices)["value_target"], short)
