@@ -1,4 +1,4 @@
-"""``benchmarks/moments.py`` and ``benchmarks/frozen_agents.py`` on runs that were just made."""
+"""``benchmarks/moments.py``, ``frozen_agents.py`` and ``kept_values.py`` on runs that were just made."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import csv
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
+import torch
 
+from torchrl_etdmpc.inspector import play_episode
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.training import TrainConfig, launch, preset
+from torchrl_etdmpc.training import TrainConfig, launch, load_agent, preset
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SMALL = {
@@ -114,4 +117,36 @@ def test_frozen_agents_refuses_what_it_cannot_play(tmp_path, monkeypatch):
         script["main"]()
     monkeypatch.setattr("sys.argv", ["frozen_agents.py", "x", "--episodes", "0", "--out", str(tmp_path / "table.csv")])
     with pytest.raises(SystemExit, match="--episodes must be at least 1"):
+        script["main"]()
+
+
+def test_values_stand_beside_what_the_next_step_makes_of_them(tmp_path, monkeypatch, capsys):
+    train(tmp_path / "run")
+    script = runpy.run_path(str(BENCHMARKS / "kept_values.py"))
+    command = ["kept_values.py", str(tmp_path / "run"), "--every", "10", "--out", str(tmp_path / "values.csv")]
+    monkeypatch.setattr("sys.argv", command)
+    script["main"]()
+    table = pd.read_csv(tmp_path / "values.csv")
+    assert list(table.columns) == script["COLUMNS"]
+    assert table.groupby("who").size().to_dict() == {"planner": 50, "policy alone": 50}
+    assert capsys.readouterr().out.count("in the mean: ") == 2
+    agent, config, _ = load_agent(RunDirectory(tmp_path / "run").last_agent, compile_setting="off")
+    episode = play_episode(agent.eval_planner, config.task_spec, seed=100)
+    rows = table[table["who"] == "planner"]
+    with torch.no_grad():
+        values = agent.world_model.values(agent.world_model.encode(episode.observation)).mean(-1).numpy()
+    rewards, discount = episode.reward.numpy(), agent.eval_planner.discount
+    assert rows["value"].to_numpy() == pytest.approx(values[:-1], abs=1e-3)
+    assert rows["real step"].to_numpy() == pytest.approx(rewards + discount * values[1:], abs=2e-3)
+    powers = discount ** np.arange(51)
+    assert rows["followed"].iloc[0] == pytest.approx(powers[:-1] @ rewards + powers[-1] * values[-1], abs=0.01)
+
+
+def test_what_has_no_values_to_look_at_is_one_line(tmp_path, monkeypatch):
+    script = runpy.run_path(str(BENCHMARKS / "kept_values.py"))
+    monkeypatch.setattr("sys.argv", ["kept_values.py", str(tmp_path)])
+    with pytest.raises(SystemExit, match="name the directory of a run"):
+        script["main"]()
+    monkeypatch.setattr("sys.argv", ["kept_values.py", str(tmp_path), "--every", "0"])
+    with pytest.raises(SystemExit, match="--every must be at least 1"):
         script["main"]()

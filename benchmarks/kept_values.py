@@ -1,0 +1,93 @@
+"""What keeps the values of a trained agent up where nothing is paid?
+
+    python benchmarks/kept_values.py runs/mine
+    python benchmarks/kept_values.py runs/mine --seed 7 --every 20 --out values.csv
+
+Plays an episode from a run's last checkpoint, with the planner as the run evaluates it and with the policy alone, and
+sets beside the value of each state what the next step is said to make of it: the one that the model imagines of the
+policy's mean action, which is the thesis' value target, and the one that was made. Values that the imagined step keeps
+up and the real one does not are sustained by the model. Prints a row every so many decisions, and the means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+
+from torchrl_etdmpc.checkpoints import CheckpointError
+from torchrl_etdmpc.inspector import Episode, play_episode
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.planners import BarePolicy
+from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.training import load_agent
+
+COLUMNS = ["who", "decision", "reward", "predicted reward", "value", "followed", "imagined step", "real step"]
+
+
+@torch.no_grad()
+def kept_values(model: WorldModel, episode: Episode, discount: float) -> pd.DataFrame:
+    """A row per decision of an episode.
+
+    ``followed`` is the discounted reward of the rest of the episode, with the value at its end; ``imagined step`` and
+    ``real step`` are what one step of the policy in the model, and the one that was made, are worth.
+    """
+    latents = model.encode(episode.observation)
+    here = latents[:-1]
+    values = model.values(latents).mean(-1)
+    policy = model.policy(here)[0].clamp(-1, 1)
+    imagined = model.values(model.next(here.unsqueeze(0), policy)).mean((0, -1))
+    followed, rest = [], torch.zeros(()) if episode.terminated else values[-1]
+    for reward in episode.reward.flip(0):
+        rest = reward + discount * rest
+        followed.append(rest.item())
+    columns = {
+        "decision": range(len(here)),
+        "reward": episode.reward,
+        "predicted reward": model.reward(here, episode.action),
+        "value": values[:-1],
+        "followed": followed[::-1],
+        "imagined step": model.reward(here, policy) + discount * imagined,
+        "real step": episode.reward + discount * values[1:],
+    }
+    return pd.DataFrame(columns)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run_dir", type=Path)
+    parser.add_argument("--seed", type=int, default=100, help="of the start; a run's evaluations have other ones")
+    parser.add_argument("--every", type=int, default=50, help="decisions between two printed rows")
+    parser.add_argument("--out", type=Path, help="a CSV file, of every decision")
+    arguments = parser.parse_args()
+    if arguments.every < 1:
+        sys.exit("error: --every must be at least 1.")
+    run = RunDirectory(arguments.run_dir)
+    if not run.last_agent.is_file():
+        sys.exit(f"error: {run.path} has no {run.last_agent.relative_to(run.path)}; name the directory of a run.")
+    torch.set_num_threads(1)
+    try:
+        agent, config, _ = load_agent(run.last_agent, compile_setting="off")
+        players: dict[str, Any] = {"planner": agent.eval_planner, "policy alone": BarePolicy(agent.acting_model)}
+        tables = []
+        for who, player in players.items():
+            episode = play_episode(player, config.task_spec, seed=arguments.seed)
+            table = kept_values(agent.acting_model, episode, float(agent.eval_planner.discount))
+            table.insert(0, "who", who)
+            tables.append(table)
+            print(f"{who}: return {episode.reward.sum():.0f}")
+            print(table.iloc[:: arguments.every, 1:].to_string(index=False, float_format="{:.1f}".format))
+            mean = table[COLUMNS[2:]].mean()
+            print("in the mean: " + ", ".join(f"{name} {number:.2f}" for name, number in mean.items()), flush=True)
+        if arguments.out:
+            pd.concat(tables).round(3).to_csv(arguments.out, index=False, columns=COLUMNS)
+    except (CheckpointError, OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
