@@ -80,6 +80,8 @@ def main() -> None:
             table.insert(0, "who", who)
             tables.append(table)
             print(f"{who}: return {episode.reward.sum():.0f}")
+            ends = zip(*(bound.tolist() for bound in episode.observation.aminmax(dim=0)), strict=True)
+            print("observations: " + ", ".join(f"{low:.2g} to {high:.2g}" for low, high in ends))
             print(table.iloc[:: arguments.every, 1:].to_string(index=False, float_format="{:.1f}".format))
             mean = table[COLUMNS[2:]].mean()
             print("in the mean: " + ", ".join(f"{name} {number:.2f}" for name, number in mean.items()), flush=True)
