@@ -304,6 +304,7 @@ def _plain_errors(
     discount: float = 0.9,
     value_beta: float = 0.0,
     value_replayed: float = 0.0,
+    value_expectile: float = 0.5,
     kl_direction: str = "backward",
 ) -> dict[str, Tensor]:
     """Unweighted errors ``[B, T]`` with gradient, without dropout.
@@ -315,6 +316,7 @@ def _plain_errors(
         discount (float): of the value targets.
         value_beta (float): as in the loss.
         value_replayed (float): as in the loss.
+        value_expectile (float): as in the loss.
         kl_direction (str): as in the loss.
     """
     world_model = loss.world_model
@@ -396,7 +398,8 @@ def _plain_errors(
             here.setdefault("reward", []).append(_cross_entropy(reward_logits(latent, action), reward, bins))
             for j in range(num_values):
                 logits = _network(weights["value_head"], latent, hidden=2, member=j)
-                here.setdefault("value", []).append(_cross_entropy(logits, target, bins))
+                weight = torch.where(target > _expected(logits, bins), value_expectile, 1 - value_expectile)
+                here.setdefault("value", []).append(2 * weight.detach() * _cross_entropy(logits, target, bins))
             if "termination_head" in weights:
                 logit = termination_logit(successor)
                 flag = slices["next", "terminated"][:, k, 0]

@@ -103,6 +103,8 @@ def test_a_missing_key_is_named_together_with_the_way_to_rename_it(make_loss, sl
         ("whole value", "value_beta", float("nan"), "value_beta must be finite and not negative, got nan"),
         ("whole value", "value_replayed", -0.1, r"value_replayed must be in \[0, 1\], got -0.1"),
         ("whole value", "value_replayed", 1.1, r"value_replayed must be in \[0, 1\], got 1.1"),
+        ("whole value", "value_expectile", 0.0, r"value_expectile must be in \(0, 1\), got 0.0; 0.5 is the mean"),
+        ("whole value", "value_expectile", 1.0, r"value_expectile must be in \(0, 1\), got 1.0"),
         ("whole policy", "scale_tau", -0.1, r"scale_tau must be in \[0, 1\], got -0.1"),
         ("whole policy", "scale_tau", 1.1, r"scale_tau must be in \[0, 1\], got 1.1"),
         ("whole policy", "kl_direction", "up", "kl_direction must be one of backward, forward, got 'up'"),

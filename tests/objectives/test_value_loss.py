@@ -17,7 +17,17 @@ def _noise(slices, seed: int = 7):
 
 @pytest.mark.parametrize("kind", ["value", "whole"])
 @pytest.mark.parametrize("termination", [False, True])
-@pytest.mark.parametrize(("value_beta", "value_replayed"), [(0.0, 0.0), (1.5, 0.0), (0.0, 1.0), (1.5, 0.4)])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"value_beta": 1.5},
+        {"value_replayed": 1.0},
+        {"value_expectile": 0.8},
+        {"value_beta": 1.5, "value_replayed": 0.4, "value_expectile": 0.3},
+    ],
+    ids=str,
+)
 def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step(
     make_world_model,
     make_loss,
@@ -27,10 +37,8 @@ def test_the_loss_equals_a_plain_reference_written_head_by_head_and_step_by_step
     depth_mean,
     kind,
     termination,
-    value_beta,
-    value_replayed,
+    options,
 ):
-    options = {"value_beta": value_beta, "value_replayed": value_replayed}
     loss = make_loss(kind, make_world_model(termination=termination), **options).eval()
     errors = plain_errors(loss, slices, _noise(slices), **options)
     out = run_seeded(loss, slices)

@@ -248,6 +248,7 @@ def test_every_planner_plans_with_the_averaged_weights_if_asked(tiny_agent):
     [
         (True, {"value_beta": 1.0}),
         (True, {"value_replayed": 1.0}),
+        (True, {"value_expectile": 0.7}),
         (True, {"kl_direction": "forward"}),
         (False, {"squashed_entropy": False}),
     ],

@@ -105,6 +105,7 @@ UTD4 = {
     "loss.value_coef": 0.1,
     "loss.value_beta": 0.0,
     "loss.value_replayed": 0.0,
+    "loss.value_expectile": 0.5,
     "loss.termination_coef": 1.0,
     "loss.entropy_coef": 1e-4,
     "loss.kl_direction": "backward",

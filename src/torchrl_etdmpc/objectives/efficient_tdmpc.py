@@ -33,6 +33,8 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         value_replayed (float): weight in the value targets of what was paid in the rest of the slice
             (:func:`~torchrl_etdmpc.objectives.replayed_value_target`) beside what the model imagines, in [0, 1]. Not in
             the thesis. Default: 0.
+        value_expectile (float): of the value targets, which the values learn, in (0, 1): above 0.5 what is above a
+            value counts more (:func:`~torchrl_etdmpc.objectives.value_error`). Not in the thesis. Default: 0.5.
         termination_coef (float): used with a termination head. Default: 1.
         policy_coef (float): Default: 1.
         entropy_coef (float): Default: 1e-4.
@@ -71,6 +73,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         value_coef: float = 0.1,
         value_beta: float = 0.0,
         value_replayed: float = 0.0,
+        value_expectile: float = 0.5,
         termination_coef: float = 1.0,
         policy_coef: float = 1.0,
         entropy_coef: float = 1e-4,
@@ -97,6 +100,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
                     value_coef=value_coef,
                     value_beta=value_beta,
                     value_replayed=value_replayed,
+                    value_expectile=value_expectile,
                     discount=discount,
                 ),
                 policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),

@@ -103,14 +103,21 @@ def replayed_value_target(
     return bootstrapped_returns(reward, values, discount, terminated=terminated, counts=counts)
 
 
-def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor, *, dropout: bool) -> Tensor:
+def value_error(
+    world_model: WorldModel, rollout: LatentRollout, target: Tensor, *, dropout: bool, expectile: float = 0.5
+) -> Tensor:
     """Cross-entropy of every value head on every dynamics head's rollout, ``CE(V_j(zhat_{k,i}), y_k)``.
+
+    With an expectile above 0.5 a target counts more where it is above the value, so that of what was done in a state
+    the better counts more (implicit Q-learning, arXiv:2110.06169, whose squared error is the cross-entropy here).
 
     Args:
         world_model (WorldModel): the value heads.
         rollout (LatentRollout): T steps of F heads.
         target (Tensor): y, shape ``[T, B]``.
         dropout (bool): whether the value heads use dropout.
+        expectile (float): errors count ``2 expectile`` where the target is above the value and ``2 (1 - expectile)``
+            elsewhere. Default: 0.5, all alike.
 
     Returns:
         Tensor: mean over value and dynamics heads, shape ``[T, B]``.
@@ -122,7 +129,11 @@ def value_error(world_model: WorldModel, rollout: LatentRollout, target: Tensor,
     """
     heads = world_model.num_dynamics
     logits = world_model.value_head(head_rows(rollout.predicted[:-1]), dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
-    error = two_hot_cross_entropy(logits, head_rows(target, heads), world_model.bins)
+    target = head_rows(target, heads)
+    error = two_hot_cross_entropy(logits, target, world_model.bins)
+    if expectile != 0.5:
+        above = target > two_hot_decode(logits.detach(), world_model.bins)
+        error = error * torch.where(above, 2 * expectile, 2 * (1 - expectile))
     return mean_of_head_rows(error.mean(0), heads)
 
 
@@ -164,6 +175,8 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
             Default: 0, the mean.
         value_replayed (float): weight of :func:`replayed_value_target` beside :func:`imagined_value_target`, in
             [0, 1]. Default: 0.
+        value_expectile (float): of the targets, which the values learn, in (0, 1); see :func:`value_error`. Default:
+            0.5, their mean.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
@@ -189,11 +202,13 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         value_coef: float = 0.1,
         value_beta: float = 0.0,
         value_replayed: float = 0.0,
+        value_expectile: float = 0.5,
         rho: float = 0.5,
         ignore_termination: bool = False,
         reduction: Reduction | None = None,
     ) -> None:
         options: Any = {"value_coef": value_coef, "value_beta": value_beta, "value_replayed": value_replayed}
+        options["value_expectile"] = value_expectile
         super().__init__(
             world_model,
             [value_term(self, world_model, discount=discount, **options)],
@@ -210,13 +225,14 @@ def value_term(
     value_coef: float,
     value_beta: float,
     value_replayed: float,
+    value_expectile: float,
     discount: float,
 ) -> Term:
     """The term of the value heads, for any loss.
 
     Raises:
         TypeError: if the value heads read actions.
-        ValueError: if the discount, ``value_beta`` or ``value_replayed`` is out of range.
+        ValueError: if the discount or an option of the targets is out of range.
     """
     if isinstance(world_model, ActionValueWorldModel):
         raise TypeError(
@@ -229,10 +245,12 @@ def value_term(
         raise ValueError(f"value_beta must be finite and not negative, got {value_beta}; 0 is the mean of the heads.")
     if not 0 <= value_replayed <= 1:
         raise ValueError(f"value_replayed must be in [0, 1], got {value_replayed}.")
+    if not 0 < value_expectile < 1:
+        raise ValueError(f"value_expectile must be in (0, 1), got {value_expectile}; 0.5 is the mean.")
     paid = ("reward",) if world_model.termination_head is None else ("reward", "terminated")
     return Term(
         "value",
-        partial(_value, loss, value_beta, value_replayed),
+        partial(_value, loss, value_beta, value_replayed, value_expectile),
         value_coef,
         networks=("encoder", "dynamics", "value"),
         targets=("value",),
@@ -246,6 +264,7 @@ def _value(
     loss: LatentRolloutLoss,
     value_beta: float,
     value_replayed: float,
+    value_expectile: float,
     world_model: WorldModel,
     slices: Slices,
     rollout: LatentRollout,
@@ -271,4 +290,5 @@ def _value(
     metrics = {"value_target": target}
     if slices.prioritised:
         metrics[PRIORITY] = td_error(world_model, rollout, target)
-    return value_error(world_model, rollout, target, dropout=loss.training), metrics
+    error = value_error(world_model, rollout, target, dropout=loss.training, expectile=value_expectile)
+    return error, metrics

@@ -116,7 +116,9 @@ def build_loss(
     options["extra_terms"] = [] if path is None else own_code("loss.extra_terms", path)(world_model)
     elsewhere = ("slice_len", "tau", "discount", "extra_terms")
     action_values = isinstance(world_model, ActionValueWorldModel)
-    unused = ("kl_direction", "value_beta", "value_replayed") if action_values else ("squashed_entropy",)
+    unused = (
+        ("kl_direction", "value_beta", "value_replayed", "value_expectile") if action_values else ("squashed_entropy",)
+    )
     for name in unused:
         if getattr(config, name) != getattr(LossConfig, name):
             raise ValueError(

@@ -121,6 +121,9 @@ class LossConfig:
     """How much of the value targets, from 0 to 1, is what was paid in the rest of the replayed slice, and not what the
     model imagines of the next step. Not in the thesis, and not of action values, which learn from replayed steps
     anyway."""
+    value_expectile: float = 0.5
+    """Which expectile of their targets values learn: above 0.5 the better of what was done in a state counts more. Not
+    in the thesis, and not of action values."""
     termination_coef: float = 1.0
     """Weight of predicting the end of an episode, where there is a termination head."""
     entropy_coef: float = 1e-4
