@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
-from torchrl_etdmpc.objectives import imagined_value_target, replayed_value_target
+from torchrl_etdmpc.functional import two_hot_encode
+from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import LatentRollout, imagined_value_target, replayed_value_target, value_error
 
 DISCOUNT = 0.99
 
@@ -98,3 +102,21 @@ def test_a_slice_that_ends_early_is_worth_what_its_last_counted_step_leads_to(ma
     slices["next", "reward"][:, 2:] = 1e6
     slices["next", "observation"][:, 2:] = 1e6
     torch.testing.assert_close(loss(slices)["value_target"], short)
+
+
+@pytest.mark.parametrize("expectile", [0.2, 0.5, 0.7])
+def test_values_of_equally_frequent_targets_settle_at_their_expectile(expectile):
+    world_model = WorldModel(5, 3, latent_dim=16, mlp_dim=12, num_dynamics=2)  # values are their bias alone
+    targets = torch.tensor([[0.0, 100.0]])
+    better, worse = (two_hot_encode(targets[0, i], world_model.bins) for i in (1, 0))
+    settled = expectile * better + (1 - expectile) * worse
+    with torch.no_grad():
+        world_model.value_head.output.bias.copy_(settled.clamp_min(1e-12).log())
+    rollout = LatentRollout(torch.rand(2, 2, 16), torch.rand(2, 2, 2, 16))
+    bias = world_model.value_head.output.bias
+    for asked in (0.2, 0.5, 0.7):
+        error = value_error(world_model, rollout, targets, dropout=False, expectile=asked).mean()
+        (gradient,) = torch.autograd.grad(error, bias)
+        assert (gradient.abs().max() < 1e-6) == (asked == expectile)
+    value = world_model.values(torch.rand(16))
+    torch.testing.assert_close(value, torch.full((2,), math.expm1(expectile * math.log(101))), rtol=1e-4, atol=0)
