@@ -34,7 +34,16 @@ def test_the_exported_policy_acts_like_the_live_one_for_any_number_of_states(sta
         torch.testing.assert_close(export_policy(model).module()(observation), expected)
 
 
-@pytest.mark.parametrize("make", [make_model, lambda: make_model().double(), lambda: LineWorld(action_dim=5)])
+def make_standardising_model() -> WorldModel:
+    model = make_model(normalize_observations=True)
+    model.encoder.observe(5 + 3 * torch.randn(64, 5))
+    return model
+
+
+@pytest.mark.parametrize(
+    "make",
+    [make_model, make_standardising_model, lambda: make_model().double(), lambda: LineWorld(action_dim=5)],
+)
 @pytest.mark.parametrize("states", [1, 3])
 def test_the_exported_planner_plans_like_the_live_one_and_draws_new_noise(states, make):
     planner = make_planner(make())

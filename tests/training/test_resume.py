@@ -138,7 +138,8 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, st
         {"replay": {"capacity": 30}},
         pytest.param({"reanalyze": {"every": 0}}, marks=pytest.mark.slow),
         {"overlap": True},
-        {"optim": {"average_decay": 0.9, "lr_halved_after": 7}},
+        {"optim": {"average_decay": 0.9, "lr_halved_after": 7}, "model": {"normalize_observations": True}},
+        {"loss": {"value_replayed": 0.5, "value_expectile": 0.7}, "model": {"normalize_observations": True}},
         pytest.param({"planner": {"first_action": "mean"}, "eval_policy": True}, marks=pytest.mark.slow),
     ],
 )

@@ -457,7 +457,7 @@ def test_training_goes_on_bit_for_bit_from_a_saved_state():
 
 
 def test_averaged_weights_follow_those_that_are_trained():
-    world_model = make_world_model()
+    world_model = make_world_model(normalize_observations=True)
     updater = Updater(EfficientTDMPCLoss(world_model, discount=0.9, ignore_termination=True), average_decay=0.75)
     averaged = updater.acting_model
     expected = {name: parameter.detach().clone() for name, parameter in world_model.named_parameters()}
@@ -470,7 +470,10 @@ def test_averaged_weights_follow_those_that_are_trained():
         assert not parameter.requires_grad
         assert not torch.equal(parameter, world_model.get_parameter(name))
     assert averaged.version == world_model.version == 3
-    again = Updater(EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True), average_decay=0.75)
+    assert averaged.encoder.norm.batches == 3
+    assert torch.equal(averaged.encoder.norm.mean, world_model.encoder.norm.mean)
+    other = make_world_model(normalize_observations=True)
+    again = Updater(EfficientTDMPCLoss(other, discount=0.9, ignore_termination=True), average_decay=0.75)
     again.load_state_dict(updater.state_dict())
     assert all(map(torch.equal, again.acting_model.parameters(), averaged.parameters()))
 
