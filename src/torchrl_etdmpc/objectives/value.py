@@ -132,7 +132,7 @@ def value_error(
     target = head_rows(target, heads)
     error = two_hot_cross_entropy(logits, target, world_model.bins)
     if expectile != 0.5:
-        above = target > two_hot_decode(logits.detach(), world_model.bins)
+        above = target > two_hot_decode(logits.detach().to(world_model.bins.dtype), world_model.bins)
         error = error * torch.where(above, 2 * expectile, 2 * (1 - expectile))
     return mean_of_head_rows(error.mean(0), heads)
 
