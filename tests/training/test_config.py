@@ -338,6 +338,7 @@ def test_an_unknown_setting_is_refused_with_the_known_ones(settings, name, known
 REFUSED_AT_ONCE = [
     ({"model__activation": "tanh"}, "model.activation must be one of mish, silu, relu, got 'tanh'."),
     ({"planner__score": "median"}, "planner.score must be one of final, mean, adaptive, got 'median'."),
+    ({"planner__score": None}, "planner.score must be one of final, mean, adaptive, got None."),
     ({"planner__first_action": "worst"}, "planner.first_action must be one of elite, mean, best, got 'worst'."),
     (
         {"planner__scoring_dtype": "int8"},

@@ -431,7 +431,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         own_code(OWN_CODE[name], value)
         return value
     if typing.get_origin(hint) in (types.UnionType, typing.Union):  # the latter with a Literal in it
-        if value is None:
+        if value is None and type(None) in typing.get_args(hint):
             return None
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
     choices = typing.get_args(hint)
