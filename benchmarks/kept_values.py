@@ -5,8 +5,9 @@
 
 Plays an episode from a run's last checkpoint, with the planner as the run evaluates it and with the policy alone, and
 sets beside the value of each state what the next step is said to make of it: the one that the model imagines of the
-policy's mean action, which is the thesis' value target, and the one that was made. Values that the imagined step keeps
-up and the real one does not are sustained by the model. Prints a row every so many decisions, and the means.
+policy's mean action, which is the thesis' value target without its noise, and the one that was made. Values that the
+imagined step keeps up and the real one does not are sustained by the model. Prints a row every so many decisions, and
+the means.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ import pandas as pd
 import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError
+from torchrl_etdmpc.functional import bootstrapped_returns
 from torchrl_etdmpc.inspector import Episode, play_episode
 from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives import imagined_value_target
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.training import load_agent
@@ -37,22 +40,18 @@ def kept_values(model: WorldModel, episode: Episode, discount: float) -> pd.Data
     ``real step`` are what one step of the policy in the model, and the one that was made, are worth.
     """
     latents = model.encode(episode.observation)
-    here = latents[:-1]
-    values = model.values(latents).mean(-1)
-    policy = model.policy(here)[0].clamp(-1, 1)
-    imagined = model.values(model.next(here.unsqueeze(0), policy)).mean((0, -1))
-    followed, rest = [], torch.zeros(()) if episode.terminated else values[-1]
-    for reward in episode.reward.flip(0):
-        rest = reward + discount * rest
-        followed.append(rest.item())
+    here, values = latents[:-1], model.values(latents).mean(-1)
+    following = values[1:].clone()
+    if episode.terminated:
+        following[-1] = 0
     columns = {
         "decision": range(len(here)),
         "reward": episode.reward,
         "predicted reward": model.reward(here, episode.action),
         "value": values[:-1],
-        "followed": followed[::-1],
-        "imagined step": model.reward(here, policy) + discount * imagined,
-        "real step": episode.reward + discount * values[1:],
+        "followed": bootstrapped_returns(episode.reward, following, discount),
+        "imagined step": imagined_value_target(model, model.values, here, torch.zeros_like(episode.action), discount),
+        "real step": episode.reward + discount * following,
     }
     return pd.DataFrame(columns)
 

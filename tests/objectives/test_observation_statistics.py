@@ -107,6 +107,26 @@ class OwnEncoder(nn.Module):
         return simnorm(self.linear(self.norm(observation)), 8)
 
 
+def test_an_encoder_that_only_standardises_has_nothing_to_learn_and_moves_its_statistics():
+    class Standardising(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.norm = RunningNorm(16)
+
+        def observe(self, observation: torch.Tensor) -> None:
+            self.norm.observe(observation)
+
+        def forward(self, observation: torch.Tensor) -> torch.Tensor:
+            return simnorm(self.norm(observation), 8)
+
+    model = WorldModel(None, 2, latent_dim=16, mlp_dim=12, encoder=Standardising())
+    loss = EfficientTDMPCLoss(model, discount=0.9)
+    SoftUpdate(loss, tau=0.01)
+    for _ in range(2):
+        assert loss(random_slices(16, 2))["loss_value"].isfinite()
+    assert model.encoder.norm.batches == 2
+
+
 def test_an_encoder_of_ones_own_that_begins_with_buffers_is_trained_and_shown_what_it_sees():
     model = WorldModel(None, 2, latent_dim=16, mlp_dim=12, encoder=OwnEncoder())
     loss = EfficientTDMPCLoss(model, discount=0.9)

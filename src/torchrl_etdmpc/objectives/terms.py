@@ -240,7 +240,7 @@ class LatentRolloutLoss(LossModule):
     q_scale: Tensor
     scale_tau: float
     kl_direction: KLDirection
-    _trained: dict[str, tuple[Tensor, set[int]]]
+    _trained: dict[str, tuple[Tensor | None, set[int]]]
     """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
 
     _attributes: ClassVar[dict[str, str]] = {
@@ -496,12 +496,13 @@ class LatentRolloutLoss(LossModule):
             held: Any = self._modules.get(f"{name}_params")
             if held is None:
                 continue
-            # A network may begin with buffers.
-            network, first = getattr(self.world_model, attribute), _first(held, nn.Parameter)
-            now = next(network.parameters())
-            if self._trained.get(name, (None,))[0] is not first:
-                own = (value for value in held.values(True, True) if isinstance(value, nn.Parameter))
-                self._trained[name] = first, {id(parameter) for parameter in own}
+            # An encoder may begin with buffers, and have nothing else.
+            own = (value for value in held.values(True, True) if isinstance(value, nn.Parameter))
+            network, first = getattr(self.world_model, attribute), next(own, None)
+            now = next(network.parameters(), None)
+            if name not in self._trained or self._trained[name][0] is not first:
+                parameters = () if first is None else (first, *own)
+                self._trained[name] = first, {id(parameter) for parameter in parameters}
             if now is not first or {id(parameter) for parameter in network.parameters()} != self._trained[name][1]:
                 raise RuntimeError(
                     f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
@@ -509,7 +510,9 @@ class LatentRolloutLoss(LossModule):
                     "the loss and its optimizer afterwards."
                 )
             target: Any = self._modules.get(f"target_{name}_params")
-            if target is not None and (_first(target).dtype, _first(target).device) != (now.dtype, now.device):
+            if target is None or now is None:
+                continue
+            if (_first(target).dtype, _first(target).device) != (now.dtype, now.device):
                 raise RuntimeError(
                     f"world_model.{attribute} is {now.dtype} on {now.device}, its targets are {_first(target).dtype} "
                     f"on {_first(target).device}; move or cast the loss, which takes the world model along: "
@@ -647,8 +650,8 @@ class LatentRolloutLoss(LossModule):
         return error * powers.unsqueeze(-1)
 
 
-def _first(params: Any, kind: type[Tensor] = Tensor) -> Tensor:
-    return next(value for value in params.values(True, True) if isinstance(value, kind))
+def _first(params: Any) -> Tensor:
+    return next(iter(params.values(True, True)))
 
 
 def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:
