@@ -172,6 +172,50 @@ def test_a_frozen_parameter_stays_as_it_is():
     assert term.function.scale != 1
 
 
+@pytest.mark.parametrize("frozen", [["encoder"], ["value_head"], ["policy"], ["encoder", "dynamics", "value_head"]])
+def test_a_wholly_frozen_network_stays_and_the_others_learn(frozen):
+    world_model = make_world_model()
+    for name in frozen:
+        getattr(world_model, name).requires_grad_(False)
+    updater = make_updater(world_model)
+    before = {name: parameter.clone() for name, parameter in world_model.named_parameters()}
+    seeded_step(updater, make_batch())
+    moved = {name for name, p in world_model.named_parameters() if not torch.equal(p, before[name])}
+    assert moved == {name for name, p in world_model.named_parameters() if p.requires_grad}
+    assert updater.skipped == 0
+
+
+def test_the_target_of_a_frozen_weight_stays_and_the_others_follow():
+    updater = make_updater()
+    names = [name for name, _ in updater.loss.value_params.flatten_keys(".").items()]
+    values = dict(updater.loss.value_params.flatten_keys(".").items())
+    values[names[0]].requires_grad_(False)
+    updater = Updater(updater.loss, tau=0.5)
+    targets = {name: target.clone() for name, target in updater.loss.target_value_params.flatten_keys(".").items()}
+    seeded_step(updater, make_batch())
+    followed = dict(updater.loss.target_value_params.flatten_keys(".").items())
+    assert torch.equal(followed[names[0]], targets[names[0]])
+    for name in names[1:]:
+        torch.testing.assert_close(followed[name], torch.lerp(targets[name], values[name].detach(), 0.5))
+
+
+def test_pretraining_with_the_policy_alone_to_train_changes_nothing():
+    world_model = make_world_model().requires_grad_(False)
+    world_model.policy.requires_grad_(True)
+    updater = make_updater(world_model)
+    before = [parameter.clone() for parameter in world_model.parameters()]
+    updater.step(make_batch(), distill=False)
+    assert all(torch.equal(*pair) for pair in zip(world_model.parameters(), before, strict=True))
+    seeded_step(updater, make_batch())
+    moved = [not torch.equal(*pair) for pair in zip(world_model.parameters(), before, strict=True)]
+    assert moved == [parameter.requires_grad for parameter in world_model.parameters()]
+
+
+def test_a_loss_with_nothing_to_train_is_refused():
+    with pytest.raises(ValueError, match=r"^the loss has no parameter to train; all of them are frozen"):
+        make_updater(make_world_model().requires_grad_(False))
+
+
 def test_a_parameter_of_another_dtype_is_refused_with_the_network_that_has_it():
     world_model = make_world_model()
     term = Term("decoder", Decoder(world_model))

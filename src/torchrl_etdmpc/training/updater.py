@@ -58,7 +58,7 @@ class Updater:
             weights, or that world model itself.
 
     Raises:
-        ValueError: if an argument is out of range, or parameters differ in dtype or device.
+        ValueError: if an argument is out of range, parameters differ in dtype or device, or there is none to train.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
@@ -94,25 +94,32 @@ class Updater:
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
-        # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
-        SoftUpdate(loss, tau=min(tau, 0.5))
         self.average_decay = average_decay
         model = loss.world_model
         self.acting_model = copy.deepcopy(model).requires_grad_(False) if average_decay else model
         self.parts = _parts(loss)
+        if not self.parts:
+            raise ValueError("the loss has no parameter to train; all of them are frozen.")
         self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
-        values = dict(loss.value_params.flatten_keys(".").items())
-        targets = dict(loss.target_value_params.flatten_keys(".").items())
-        self._flat_targets = _moved_together([targets[name] for name in values])
+        self._clipped = {name: [p for p in parts if p in self.parts] for name, parts in _CLIPPED_TOGETHER.items()}
+        values = [name for name, value in loss.value_params.flatten_keys(".").items() if value.requires_grad]
+        self._flat_targets: Tensor | None = None
+        if values:
+            # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
+            SoftUpdate(loss, tau=min(tau, 0.5))
+            targets = dict(loss.target_value_params.flatten_keys(".").items())
+            self._flat_targets = _moved_together([targets[name] for name in values])
         self._views = [p for tensors in self.parts.values() for p in tensors]
         self._addresses = [p.data_ptr() for p in self._views]
-        device = self._flat_targets.device
+        device = self._views[0].device
+        groups: list[tuple[tuple[str, ...], dict[str, float]]] = [
+            (("encoder",), {"lr": lr * encoder_lr_scale}),
+            (("heads", "values"), {}),
+            (("policy",), {"eps": 1e-5}),
+        ]
+        trained = [([self._flat[part] for part in parts if part in self._flat], rates) for parts, rates in groups]
         self.optimizer = torch.optim.Adam(
-            [
-                {"params": [self._flat["encoder"]], "lr": lr * encoder_lr_scale},
-                {"params": [self._flat["heads"], self._flat["values"]]},
-                {"params": [self._flat["policy"]], "eps": 1e-5},
-            ],
+            [{"params": params, **rates} for params, rates in trained if params],
             lr=lr,
             fused=True,
             capturable=device.type == "cuda",
@@ -155,7 +162,7 @@ class Updater:
                 metrics, gradients, skip = self._compiled(*inputs)
         self.loss.write_priority(batch, metrics)
         for name, not_finite in skip.items():
-            for part in _CLIPPED_TOGETHER[name]:
+            for part in self._clipped[name]:
                 self._flat[part].grad = gradients[part]
             # The optimiser leaves the weights as they are on the device, as for AMP's gradient scaler.
             self.optimizer.grad_scale = None  # pyright: ignore[reportAttributeAccessIssue]
@@ -164,10 +171,12 @@ class Updater:
             self.optimizer.zero_grad()
         if self._schedule is not None:
             self._schedule.step()
-        skipped = torch.stack(list(skip.values())).amax().long()
-        self.skipped += skipped
-        self.skipped_in_a_row.add_(1).mul_(skipped)
-        self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
+        if skip:
+            skipped = torch.stack(list(skip.values())).amax().long()
+            self.skipped += skipped
+            self.skipped_in_a_row.add_(1).mul_(skipped)
+        if self._flat_targets is not None:
+            self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
         self.loss.world_model.version += 1
         self._average()
         return TensorDict(metrics, batch_size=[]).clone()
@@ -216,7 +225,9 @@ class Updater:
         out = self.loss.evaluate(slices, targets)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
-        clipped = {name: parts for name, parts in _CLIPPED_TOGETHER.items() if self.loss.distill or name != "policy"}
+        clipped = {name: parts for name, parts in self._clipped.items() if parts}
+        if not self.loss.distill:
+            clipped.pop("policy", None)
         gradients = self._flat_gradients(total, [part for names in clipped.values() for part in names])
         for name, names in clipped.items():
             norm = torch.stack([gradients[part].norm() for part in names]).norm()
@@ -224,13 +235,15 @@ class Updater:
             gradients.update({part: factor * gradients[part] for part in names})
             metrics[f"grad_norm_{name}"] = norm
         skip = {name: metrics[f"grad_norm_{name}"].isfinite().logical_not().float() for name in clipped}
-        if "policy" in skip:
+        if len(skip) == 2:
             skip["policy"] = torch.maximum(skip["policy"], skip["model"])
         return metrics, gradients, skip
 
     def _flat_gradients(self, total: Tensor, parts: list[str]) -> dict[str, Tensor]:
         """The gradient of each part, in the layout of its piece of memory."""
         parameters = [p for part in parts for p in self.parts[part]]
+        if not parameters:
+            return {}
         found = torch.autograd.grad(total, parameters, allow_unused=True)
         if any(gradient is None for gradient in found):
             names = {id(parameter): name for name, parameter in self.loss.named_parameters()}
@@ -264,7 +277,7 @@ class Updater:
 
 
 def _parts(loss: LatentRolloutLoss) -> dict[str, list[nn.Parameter]]:
-    """The parameters by how they are trained: what has no rule of its own is trained as the heads are."""
+    """The trained parameters by how they are trained: what has no rule of its own is trained as the heads are."""
     parts: dict[str, list[nn.Parameter]] = {"encoder": [], "heads": [], "values": [], "policy": []}
     first = next(loss.parameters())
     for network, parameters in loss.network_parameters().items():
@@ -277,7 +290,7 @@ def _parts(loss: LatentRolloutLoss) -> dict[str, list[nn.Parameter]]:
                 )
             if parameter.requires_grad:
                 parts[part].append(parameter)
-    return parts
+    return {part: parameters for part, parameters in parts.items() if parameters}
 
 
 def _joined(tensors: Sequence[Tensor]) -> Tensor:
