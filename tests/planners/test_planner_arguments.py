@@ -32,6 +32,7 @@ from torchrl_etdmpc.testing import LineWorld
         ({"discount": 1.1}, r"discount must be in \(0, 1\], got 1\.1\."),
         ({"first_action": "last"}, r"first_action must be one of elite, mean, best, got 'last'\."),
         ({"eval_first_action": "last"}, r"eval_first_action must be one of elite, mean, best, got 'last'\."),
+        ({"initial": "zeros"}, r"initial must be one of wide, policy, got 'zeros'\."),
         ({"score": "best"}, r"score must be one of final, mean, adaptive or a callable, got 'best'\."),
         (
             {"score": FinalScore(), "beta": 1.0},

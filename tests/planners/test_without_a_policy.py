@@ -81,3 +81,8 @@ def test_what_needs_a_policy_says_so():
     for name, needy in {"BarePolicy": BarePolicy, "export_policy": export_policy}.items():
         with pytest.raises(TypeError, match=f"^{name}{message}"):
             needy(Line())
+
+
+def test_a_search_cannot_begin_at_a_policy_that_is_not_there():
+    with pytest.raises(ValueError, match=r"^initial must be 'wide' for a model without a policy \(Line\), got 'po"):
+        EnsembleMPPIPlanner(LatentEnv(Line()), initial="policy", **START)

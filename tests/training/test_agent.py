@@ -80,7 +80,7 @@ def test_the_networks_that_no_preset_changes_can_be_changed(tiny_config):
 
 def test_every_setting_of_the_planner_arrives(tiny_config):
     values = {"horizon": 4, "num_samples": 20, "num_elites": 5, "num_proposals": 3, "iterations": 7}
-    values |= {"inverse_temperature": 0.7, "std_min": 0.1, "std_max": 1.5}
+    values |= {"inverse_temperature": 0.7, "std_min": 0.1, "std_max": 1.5, "initial": "policy"}
     values |= {"first_action": "mean", "eval_first_action": "elite"}
     config = PlannerConfig(**values, score="final", beta=2.0)
     world_model = build_world_model(tiny_config().model, OBSERVATION_DIM, ACTION_DIM)

@@ -76,6 +76,7 @@ UTD4 = {
     "planner.inverse_temperature": 0.5,
     "planner.std_min": 0.05,
     "planner.std_max": 2.0,
+    "planner.initial": "wide",  # not in the thesis
     "planner.first_action": "elite",
     "planner.eval_first_action": "best",
     "planner.scoring_dtype": None,
@@ -91,6 +92,7 @@ UTD4 = {
     "reanalyze.inverse_temperature": 0.5,
     "reanalyze.std_min": 0.05,
     "reanalyze.std_max": 2.0,
+    "reanalyze.initial": "wide",  # not in the thesis
     "reanalyze.first_action": "elite",
     "reanalyze.eval_first_action": "best",
     "reanalyze.scoring_dtype": None,

@@ -44,7 +44,7 @@ from torchrl_etdmpc.keys import (
     VERSION,
 )
 from torchrl_etdmpc.modules.prediction import ActionValueModel, PredictionModel, has_policy
-from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
+from torchrl_etdmpc.planners.imagination import imagined_returns, policy_gaussian, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
 from torchrl_etdmpc.planners.primer import PlanPrimer
@@ -53,6 +53,8 @@ from torchrl_etdmpc.planners.scores import Score, ScoreFunction, ScoreName, make
 FirstAction = Literal["elite", "mean", "best"]
 """Whose first action is the mean of the target: an elite drawn by its weight, the fitted mean, or the best
 candidate."""
+InitialPlan = Literal["wide", "policy"]
+"""Where a search begins: around the carried plan or zeros with the largest deviation, or where the policy is."""
 ScoringDtype = Literal["float16", "bfloat16", "float32", "float64"]
 """Names of the dtypes in which candidates can be scored."""
 
@@ -94,11 +96,16 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         discount (float): gamma, in (0, 1]. Default: 0.99.
         inverse_temperature (float): of the elites' weights (the lineage calls it "temperature"). Default: 0.5.
         std_min (float): Default: 0.05.
-        std_max (float): initial and largest standard deviation. Default: 2.
+        std_max (float): largest standard deviation, and that of the first candidates of a wide search. Default: 2.
         first_action (str): ``"elite"`` (one elite drawn by its weight; BMPC), ``"mean"`` (the fitted mean; the thesis'
             formula) or ``"best"`` (highest-scoring candidate of the last iteration). Default: ``"elite"``.
         eval_first_action (str): the same, when not exploring. Default: ``"best"``.
         warm_start (bool): whether to carry the plan from step to step. Default: ``True``.
+        initial (str): the Gaussian of the first candidates. ``"wide"`` has the carried plan for its mean, or zeros, and
+            ``std_max`` for its deviation (TD-MPC2). ``"policy"`` is the policy's own along its mean actions, its
+            deviation within ``std_min`` and ``std_max`` and the log std within the bounds for proposals: a search of
+            few candidates then improves on the policy instead of looking for it. A carried plan is not read then. Not
+            in the thesis. Default: ``"wide"``.
         scoring_dtype (torch.dtype or str, optional): in which candidates are rolled and scored, e.g.
             ``torch.bfloat16`` or ``"bfloat16"``; the weights are cast once per call, and returns are summed in the
             weights' own dtype. Default: ``None``, that of the weights.
@@ -149,6 +156,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         first_action: FirstAction = "elite",
         eval_first_action: FirstAction = "best",
         warm_start: bool = True,
+        initial: InitialPlan = "wide",
         scoring_dtype: torch.dtype | ScoringDtype | None = None,
         proposal_log_std_min: float | None = None,
         proposal_log_std_max: float | None = None,
@@ -174,6 +182,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         for name, choice in {"first_action": first_action, "eval_first_action": eval_first_action}.items():
             if choice not in get_args(FirstAction):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(FirstAction))}, got {choice!r}.")
+        if initial not in get_args(InitialPlan):
+            raise ValueError(f"initial must be one of {', '.join(get_args(InitialPlan))}, got {initial!r}.")
+        if initial == "policy" and not has_policy(env.world_model):
+            raise ValueError(
+                f"initial must be 'wide' for a model without a policy ({type(env.world_model).__name__}), got 'policy'."
+            )
         super().__init__(env, action_key=action_key)
         del self._modules["env"]  # the base class registers it twice; the state dict should list the weights once
         vars(self)["env"] = env
@@ -193,6 +207,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.first_action = first_action
         self.eval_first_action = eval_first_action
         self.warm_start = warm_start
+        self.initial: InitialPlan = initial
         self.scoring_dtype = _floating_dtype(scoring_dtype)
         self.proposal_log_std_bounds = _both_or_none(proposal_log_std_min, proposal_log_std_max)
         self.compiled_plan: Callable[..., Plan] | None = None
@@ -276,7 +291,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     def extra_repr(self) -> str:
         """The budget and the choices, as they were given."""
         budget = ("horizon", "num_samples", "num_elites", "num_proposals", "iterations", "discount")
-        choices = ("first_action", "eval_first_action", "warm_start")
+        choices = ("first_action", "eval_first_action", "warm_start", "initial")
         parts = [f"{name}={getattr(self, name)!r}" for name in (*budget, *choices)]
         return ", ".join([*parts, f"score={self.score!r}"])
 
@@ -466,9 +481,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             noise = PlanNoise(*(draw.reshape(states, *draw.shape[len(batch) :]) for draw in noise))
         shape = (states, self.horizon, self.world_model.action_dim)
         start = latent.new_zeros(shape) if plan_mean is None else shift_plan(plan_mean.reshape(shape))
-        gaussian = Gaussian(start, torch.full_like(start, self.std_max))
-
-        search = self._search(latent, gaussian, noise, trace)
+        search = self._search(latent, self._initial(latent, start), noise, trace)
         loc, scale, value = self._target(latent, search, noise.elite, explore)
         action = clipped_sample(loc, scale, noise.action) if explore else loc
         outputs = (action, loc, scale, value, search.gaussian.mean, search.fallback)
@@ -477,6 +490,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             return Plan(*outputs, trace=None)
         stacked = (torch.stack(field, dim=1) for field in zip(*search.steps, strict=True))
         return Plan(*outputs, trace=PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
+
+    def _initial(self, latent: Tensor, start: Tensor) -> Gaussian:
+        """The Gaussian ``[B, H, A]`` of the first candidates; ``start`` is the warm start."""
+        if self.initial == "wide" or not has_policy(self.world_model):
+            return Gaussian(start, torch.full_like(start, self.std_max))
+        mean, std = policy_gaussian(self.world_model, latent, self.horizon, self.proposal_log_std_bounds)
+        return Gaussian(mean, std.clamp(self.std_min, self.std_max))
 
     def _search(self, latent: Tensor, gaussian: Gaussian, noise: PlanNoise, trace: bool) -> _Search:
         """Draws candidates, scores them and refits the Gaussian, once per iteration, for states ``[B, L]``."""

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrl_etdmpc.functional import return_table
+from torchrl_etdmpc.functional import Gaussian, return_table
 from torchrl_etdmpc.modules.prediction import ActionValueModel, PolicyModel, PredictionModel
 
 
@@ -40,6 +40,35 @@ def propose_sequences(
             latent = world_model.next(latent, actions[-1])
     sequences = torch.stack(actions, dim=-2)  # [F, B, rounds, H, A]
     return sequences.permute(1, 2, 0, 3, 4).flatten(1, 2)[:, :proposals]
+
+
+def policy_gaussian(
+    world_model: PolicyModel, latent: Tensor, horizon: int, log_std_bounds: tuple[float, float] | None = None
+) -> Gaussian:
+    """The policy's Gaussian along its own mean actions, rolled by every dynamics head.
+
+    Mean and standard deviation are those of the mixture over heads.
+
+    Args:
+        world_model (PolicyModel): policy and dynamics.
+        latent (Tensor): states, ``[B, L]``.
+        horizon (int): H.
+        log_std_bounds (tuple of float, optional): of the policy's log std. Default: the policy's own.
+
+    Returns:
+        Gaussian: over action sequences, ``[B, H, A]``.
+    """
+    latent = latent.unsqueeze(0).expand(world_model.num_dynamics, -1, -1)
+    means, variances = [], []
+    for step in range(horizon):
+        mean, log_std = world_model.policy(latent, log_std_bounds)
+        means.append(mean)
+        variances.append((2 * log_std).exp())
+        if step + 1 < horizon:
+            latent = world_model.next(latent, mean)
+    mean, variance = torch.stack(means, dim=-2), torch.stack(variances, dim=-2)  # [F, B, H, A]
+    centre = mean.mean(0)
+    return Gaussian(centre, (variance + (mean - centre).square()).mean(0).sqrt())
 
 
 def imagined_returns(

@@ -19,7 +19,7 @@ from torchrl_etdmpc.collectors.step import Insertion
 from torchrl_etdmpc.envs import Task, get_task
 from torchrl_etdmpc.modules.normed_linear import Activation
 from torchrl_etdmpc.objectives.policy import KLDirection
-from torchrl_etdmpc.planners.ensemble_mppi import FirstAction, ScoringDtype
+from torchrl_etdmpc.planners.ensemble_mppi import FirstAction, InitialPlan, ScoringDtype
 from torchrl_etdmpc.planners.scores import ScoreName
 from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
@@ -78,6 +78,9 @@ class PlannerConfig:
     std_min: float = 0.05
     """Smallest standard deviation."""
     std_max: float = 2.0
+    initial: InitialPlan = "wide"
+    """Where a search begins: ``wide`` is around the last plan, with the largest deviation; ``policy``, which is not in
+    the thesis, is where the policy is."""
     first_action: FirstAction = "elite"
     eval_first_action: FirstAction = "best"
     scoring_dtype: ScoringDtype | None = None
