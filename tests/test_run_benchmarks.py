@@ -1,4 +1,4 @@
-"""``benchmarks/moments.py``, ``frozen_agents.py`` and ``kept_values.py`` on runs that were just made."""
+"""The benchmarks that look at a run, on runs that were just made."""
 
 from __future__ import annotations
 
@@ -149,4 +149,44 @@ def test_what_has_no_values_to_look_at_is_one_line(tmp_path, monkeypatch):
         script["main"]()
     monkeypatch.setattr("sys.argv", ["kept_values.py", str(tmp_path), "--every", "0"])
     with pytest.raises(SystemExit, match="--every must be at least 1"):
+        script["main"]()
+
+
+def test_plans_of_one_state_stand_beside_each_other(tmp_path, monkeypatch, capsys):
+    train(tmp_path / "run")
+    script = runpy.run_path(str(BENCHMARKS / "repeated_plans.py"))
+    options = ["--states", "10", "--repeats", "4", "--out", str(tmp_path / "plans.csv")]
+    monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(tmp_path / "run"), *options])
+    script["main"]()
+    assert "10 states, 4 plans each" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "plans.csv").set_index("setting")
+    assert list(table.index) == list(script["CHANGES"])
+    assert (table > 0).all(axis=None)
+    assert table.loc["wide, BMPC's budget", "spread"] < table.loc["wide", "spread"]  # a search of many repeats itself
+
+
+def test_the_divergence_of_two_plans_is_that_of_their_gaussians(tmp_path):
+    train(tmp_path / "run")
+    script = runpy.run_path(str(BENCHMARKS / "repeated_plans.py"))
+    agent, config, _ = load_agent(RunDirectory(tmp_path / "run").last_agent, compile_setting="off")
+    latent = torch.softmax(torch.randn(3, config.model.latent_dim), -1)
+    planner = agent.reanalyze_planner
+    torch.manual_seed(0)
+    row = script["repeated_plans"](agent.acting_model, config.reanalyze, latent, 2, planner.discount)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        first, second = (planner.plan(latent=latent) for _ in range(2))
+    gaussians = [torch.distributions.Normal(plan.loc, plan.scale) for plan in (first, second)]
+    there, back = (torch.distributions.kl_divergence(*pair).mean() for pair in (gaussians, gaussians[::-1]))
+    assert row["kl"] == pytest.approx(((there + back) / 2).item(), rel=1e-4)
+    assert row["spread"] == pytest.approx(((first.loc - second.loc).abs() / 2**0.5).mean().item(), rel=1e-4)
+
+
+def test_what_cannot_be_planned_twice_is_one_line(tmp_path, monkeypatch):
+    script = runpy.run_path(str(BENCHMARKS / "repeated_plans.py"))
+    monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(tmp_path)])
+    with pytest.raises(SystemExit, match="name the directory of a run"):
+        script["main"]()
+    monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(tmp_path), "--repeats", "1"])
+    with pytest.raises(SystemExit, match="--repeats at least 2"):
         script["main"]()
