@@ -65,12 +65,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.every < 1:
         sys.exit("error: --every must be at least 1.")
-    run = RunDirectory(arguments.run_dir)
-    if not run.last_agent.is_file():
-        sys.exit(f"error: {run.path} has no {run.last_agent.relative_to(run.path)}; name the directory of a run.")
     torch.set_num_threads(1)
     try:
-        agent, config, _ = load_agent(run.last_agent, compile_setting="off")
+        agent, config, _ = load_agent(RunDirectory(arguments.run_dir).last_agent, compile_setting="off")
         players: dict[str, Any] = {"planner": agent.eval_planner, "policy alone": BarePolicy(agent.acting_model)}
         tables = []
         for who, player in players.items():

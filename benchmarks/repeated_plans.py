@@ -64,12 +64,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.states < 1 or arguments.repeats < 2:
         sys.exit("error: --states must be at least 1 and --repeats at least 2.")
-    run = RunDirectory(arguments.run_dir)
-    if not run.last_agent.is_file():
-        sys.exit(f"error: {run.path} has no {run.last_agent.relative_to(run.path)}; name the directory of a run.")
     torch.set_num_threads(1)
     try:
-        agent, config, _ = load_agent(run.last_agent, compile_setting="off")
+        agent, config, _ = load_agent(RunDirectory(arguments.run_dir).last_agent, compile_setting="off")
         episode = play_episode(agent.eval_planner, config.task_spec, seed=arguments.seed)
         every = max(1, len(episode.action) // arguments.states)
         model, discount = agent.acting_model, float(agent.eval_planner.discount)
