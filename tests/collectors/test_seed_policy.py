@@ -28,6 +28,51 @@ def test_successive_actions_differ_and_follow_torch_manual_seed():
     assert not torch.equal(first, second)
 
 
+def run_lengths(actions: torch.Tensor) -> torch.Tensor:
+    """For how many decisions each value of a column ``[T, N]`` stays, the last one left out."""
+    changes = torch.nn.functional.pad((actions[1:] != actions[:-1]).T, (1, 0), value=True)  # [N, T]
+    starts = [row.nonzero().flatten() for row in changes]
+    return torch.cat([start.diff() for start in starts]).double()
+
+
+def test_a_held_action_stays_for_a_geometric_time_in_every_dimension_of_every_environment_by_itself():
+    torch.manual_seed(0)
+    policy = SeedPolicy(BOUNDS.expand(50, 2), hold=4)
+    actions = torch.stack([policy(TensorDict(batch_size=[50]))["action"] for _ in range(2000)])
+    lengths = run_lengths(actions.flatten(1))
+    assert lengths.mean() == pytest.approx(4, rel=0.02)
+    assert (lengths == 1).double().mean() == pytest.approx(1 / 4, rel=0.05)
+    changed = (actions[1:] != actions[:-1]).double()
+    assert torch.corrcoef(changed.flatten(1).T).fill_diagonal_(0).abs().max() < 0.15
+    assert kstest(actions[::100, :, 0].flatten().double(), "uniform", args=(-1, 2)).pvalue > 1e-3
+
+
+def test_a_new_action_every_time_is_drawn_as_without_the_argument():
+    torch.manual_seed(0)
+    expected = [BOUNDS.rand() for _ in range(3)]
+    torch.manual_seed(0)
+    policy = SeedPolicy(BOUNDS)
+    assert all(torch.equal(policy(TensorDict())["action"], action) for action in expected)
+
+
+def test_a_held_action_goes_on_in_a_copy_that_loads_its_state_and_is_not_what_a_buffer_stores():
+    torch.manual_seed(0)
+    policy, copy = (SeedPolicy(BOUNDS, hold=1e9) for _ in range(2))
+    action = policy(TensorDict())["action"]
+    expected = action.clone()
+    action.zero_()
+    copy.load_state_dict(policy.state_dict())
+    assert torch.equal(copy(TensorDict())["action"], expected)
+    assert not torch.equal(SeedPolicy(BOUNDS, hold=1e9)(TensorDict())["action"], expected)
+    assert not dict(policy.named_buffers())  # which would be sent to workers with the weights
+
+
+@pytest.mark.parametrize("hold", [0, 0.99, -1, float("nan")])
+def test_an_action_cannot_be_held_for_less_than_its_decision(hold):
+    with pytest.raises(ValueError, match=rf"^hold must be at least 1, got {hold}\.$"):
+        SeedPolicy(BOUNDS, hold=hold)
+
+
 @pytest.mark.parametrize("batch", [(), (3,)], ids=["one-env", "three-envs"])
 def test_the_target_is_the_standard_normal_made_at_update_zero(batch):
     out = SeedPolicy(BOUNDS.expand(*batch, 2))(TensorDict(batch_size=batch))

@@ -75,6 +75,7 @@ CONFIGURATIONS = st.fixed_dictionaries(
         "replay": st.fixed_dictionaries(
             {
                 "seed_decisions": st.integers(4, 20),
+                "seed_hold": st.sampled_from([1.0, 1.5, 8.0]),
                 "pretrain_updates": st.integers(0, 2),
                 "pretrain_policy": st.booleans(),
                 "capacity": st.integers(8, 60),

@@ -128,6 +128,7 @@ UTD4 = {
     "replay.partial": None,  # if the task terminates
     "replay.device": "auto",
     "replay.seed_decisions": None,  # max(1000, 5 episodes)
+    "replay.seed_hold": 1.0,  # not in the thesis
     "replay.pretrain_updates": None,  # as many as seed decisions
     "replay.pretrain_policy": False,
 }
@@ -356,6 +357,7 @@ REFUSED_AT_ONCE = [
         for name in ("consistency", "reward", "value", "termination", "entropy")
     ),
     ({"replay__seed_decisions": -1}, "replay.seed_decisions must not be negative, got -1."),
+    ({"replay__seed_hold": 0.5}, "replay.seed_hold must be at least 1, got 0.5."),
     ({"eval_episodes": 20_000}, "eval_episodes must be at most 10000, got 20000."),
     ({"action_repeat": 1001}, "action_repeat of task 'walker-walk' must be at most episode_length=1000, got 1001."),
     (
@@ -606,7 +608,7 @@ OF_THE_LOOP = {
     ModelConfig: {"action_values"},  # which of the two world models
     ReanalyzeConfig: {"every"},
     OptimConfig: {"batch_size", "updates_per_decision"},
-    ReplayConfig: {"capacity", "device", "seed_decisions", "pretrain_updates", "pretrain_policy"},
+    ReplayConfig: {"capacity", "device", "seed_decisions", "seed_hold", "pretrain_updates", "pretrain_policy"},
 }
 # Arguments whose default is not the class'.
 OWN_DEFAULT = {

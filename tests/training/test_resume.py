@@ -39,7 +39,7 @@ SETTINGS: dict[str, Any] = {
     "eval_episodes": 2,
     "checkpoint_every": 50,
     "log_every": 20,
-    "replay": {"seed_decisions": 24},
+    "replay": {"seed_decisions": 24, "seed_hold": 3.0},
 }
 
 

@@ -292,9 +292,10 @@ class StepCollector(BaseCollector):
         self.closed = True
 
     def state_dict(self) -> OrderedDict:
-        """Counters and the place inside the running episodes, the simulator's included (not the policy's weights).
+        """Counters, the place inside the running episodes, the simulator's included, and the seed policy's state.
 
-        Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)`` reads them.
+        Not the policy's weights. Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)``
+        reads them.
         """
         return OrderedDict(
             frames=self._frames,
@@ -302,6 +303,7 @@ class StepCollector(BaseCollector):
             simulator=simulator_state(self.env),
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
+            seed_policy=None if self.seed_policy is None else self.seed_policy.state_dict(),
         )
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
@@ -312,6 +314,8 @@ class StepCollector(BaseCollector):
         """
         self._frames = state_dict["frames"]
         self._next_trajectory = state_dict["next_trajectory"]
+        if self.seed_policy is not None and state_dict.get("seed_policy"):  # a checkpoint of before has none
+            self.seed_policy.load_state_dict(state_dict["seed_policy"])
         self._abandon_episodes()
         if state_dict.get("simulator") is None:
             if self._frames:

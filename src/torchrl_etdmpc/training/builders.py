@@ -151,7 +151,7 @@ def build_collector(
         replay_buffer=replay,
         total_frames=config.total_decisions,
         init_random_frames=config.seed_decisions,
-        seed_policy=SeedPolicy(env.action_spec),
+        seed_policy=SeedPolicy(env.action_spec, hold=config.replay.seed_hold),
         insertion=config.replay.insertion,
         exclude_keys=UNREAD,
         policy_device=agent.device,

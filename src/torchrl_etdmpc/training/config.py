@@ -177,6 +177,8 @@ class ReplayConfig:
     at most half of its free memory."""
     seed_decisions: int | None = None
     """Length of the random phase: decisions of uniform random actions. Default: max(1000, 5 episodes)."""
+    seed_hold: float = 1.0
+    """For how many decisions a random action is held in the mean. Not in the thesis, whose actions are all new."""
     pretrain_updates: int | None = None
     """Updates after the random phase. Default: as many as it had decisions."""
     pretrain_policy: bool = False
@@ -265,6 +267,7 @@ class TrainConfig:
         least_one = {name: getattr(self, name) for name in (*counts, "max_faults", "max_skipped", "threads")}
         least_one |= {"optim.batch_size": self.optim.batch_size, "replay.capacity": self.replay.capacity}
         least_one |= {"optim.updates_per_decision": self.optim.updates_per_decision}
+        least_one |= {"replay.seed_hold": self.replay.seed_hold}
         for name, number in least_one.items():
             _require(number is None or number >= 1, f"{name} must be at least 1, got {number}.")
         coefficients = {f"loss.{name}": value for name, value in vars(self.loss).items() if name.endswith("_coef")}

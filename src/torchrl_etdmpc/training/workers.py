@@ -41,14 +41,15 @@ class Actor(TensorDictModuleBase):
     Args:
         planner (EnsembleMPPIPlanner): acts when ``planning`` is true.
         planning (bool): Default: ``False``.
+        hold (float): of the seed policy. Default: 1.
     """
 
     planning: torch.Tensor
 
-    def __init__(self, planner: EnsembleMPPIPlanner, *, planning: bool = False) -> None:
+    def __init__(self, planner: EnsembleMPPIPlanner, *, planning: bool = False, hold: float = 1.0) -> None:
         super().__init__()
         self.planner = planner
-        self.seed_policy = SeedPolicy(planner.action_spec)
+        self.seed_policy = SeedPolicy(planner.action_spec, hold=hold)
         # TorchRL's types know one key only.
         self.in_keys = planner.in_keys  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = planner.out_keys  # pyright: ignore[reportAttributeAccessIssue]
@@ -103,7 +104,8 @@ class WorkerParts:
         config = self.config
         world_model = build_world_model(config.model, *self.sizes, terminates=config.task_spec.terminates)
         options: dict[str, Any] = {"discount": self.discount, "compile_mode": self.compile_mode}
-        return Actor(build_planner(world_model, config.planner, warm_start=True, **options))
+        planner = build_planner(world_model, config.planner, warm_start=True, **options)
+        return Actor(planner, hold=config.replay.seed_hold)
 
     def _prepare(self) -> None:
         """Imports what the command line has made the owner import."""
