@@ -145,7 +145,7 @@ def test_values_stand_beside_what_the_next_step_makes_of_them(tmp_path, monkeypa
 def test_what_has_no_values_to_look_at_is_one_line(tmp_path, monkeypatch):
     script = runpy.run_path(str(BENCHMARKS / "kept_values.py"))
     monkeypatch.setattr("sys.argv", ["kept_values.py", str(tmp_path)])
-    with pytest.raises(SystemExit, match="name the directory of a run"):
+    with pytest.raises(SystemExit, match="is not a file; pass a checkpoint such as"):
         script["main"]()
     monkeypatch.setattr("sys.argv", ["kept_values.py", str(tmp_path), "--every", "0"])
     with pytest.raises(SystemExit, match="--every must be at least 1"):
@@ -185,8 +185,21 @@ def test_the_divergence_of_two_plans_is_that_of_their_gaussians(tmp_path):
 def test_what_cannot_be_planned_twice_is_one_line(tmp_path, monkeypatch):
     script = runpy.run_path(str(BENCHMARKS / "repeated_plans.py"))
     monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(tmp_path)])
-    with pytest.raises(SystemExit, match="name the directory of a run"):
+    with pytest.raises(SystemExit, match="is not a file; pass a checkpoint such as"):
         script["main"]()
     monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(tmp_path), "--repeats", "1"])
     with pytest.raises(SystemExit, match="--repeats at least 2"):
         script["main"]()
+
+
+def test_what_random_actions_find_is_counted_from_the_same_starts_behind_their_beginning(tmp_path, monkeypatch):
+    script = runpy.run_path(str(BENCHMARKS / "random_phase.py"))
+    options = ["--tasks", "reacher-easy", "--holds", "1", "1e9", "--episodes", "3", "--out", str(tmp_path / "out.csv")]
+    monkeypatch.setattr("sys.argv", ["random_phase.py", *options])
+    script["main"]()
+    table = pd.read_csv(tmp_path / "out.csv")
+    rewards = [script["random_episodes"]("reacher-easy", hold, 3) for hold in (1.0, 1e9)]
+    assert all(paid.shape == (3, 500) for paid in rewards)
+    assert torch.equal(rewards[0][:, 0], rewards[1][:, 0])  # nothing has moved far by then
+    assert table["return"].tolist() == pytest.approx([paid.sum(-1).mean().item() for paid in rewards], abs=0.01)
+    assert table["found"].tolist() == [sum(bool((row[25:] > 0).any()) for row in paid) for paid in rewards]
