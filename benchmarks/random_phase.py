@@ -1,16 +1,17 @@
 """What do random actions see of a task, by how long each of them is held?
 
     python benchmarks/random_phase.py
-    python benchmarks/random_phase.py --tasks reacher-hard fish-swim --holds 1 8 --episodes 24
+    python benchmarks/random_phase.py --tasks reacher-hard fish-swim --holds 1 8 --out mine.csv
 
 Plays whole episodes of the random phase (`SeedPolicy`), the same starts with every hold. ``return`` is the mean of the
 episodes, ``found`` in how many of them something was paid after their first 25 decisions, what a lucky start pays left
-out. Writes `benchmarks/results/cpu/random_phase.csv`.
+out. Writes `benchmarks/results/cpu/random_phase.csv` or what ``--out`` names.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import pandas as pd
@@ -45,6 +46,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=24)
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
+    if arguments.episodes < 1 or not all(hold >= 1 for hold in arguments.holds):
+        sys.exit("error: --episodes and --holds must be at least 1.")
     rows = []
     for task in arguments.tasks:
         for hold in arguments.holds:

@@ -203,3 +203,7 @@ def test_what_random_actions_find_is_counted_from_the_same_starts_behind_their_b
     assert torch.equal(rewards[0][:, 0], rewards[1][:, 0])  # nothing has moved far by then
     assert table["return"].tolist() == pytest.approx([paid.sum(-1).mean().item() for paid in rewards], abs=0.01)
     assert table["found"].tolist() == [sum(bool((row[25:] > 0).any()) for row in paid) for paid in rewards]
+    for wrong in (["--episodes", "0"], ["--holds", "4", "0.5"]):
+        monkeypatch.setattr("sys.argv", ["random_phase.py", *wrong])
+        with pytest.raises(SystemExit, match="--episodes and --holds must be at least 1"):
+            script["main"]()

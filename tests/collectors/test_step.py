@@ -610,6 +610,38 @@ def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
         assert row["observation"][1] == 0
 
 
+def test_what_a_seed_policy_holds_is_saved_with_the_seed_phase_and_not_after_it():
+    def make_collector() -> StepCollector:
+        env = make_env((5,))
+        seeding = SeedPolicy(env.action_spec, hold=1e9, plan_key="target")
+        options = {"replay_buffer": make_replay(), "init_random_frames": 3}
+        return StepCollector(env, SeedPolicy(env.action_spec, plan_key="target"), seed_policy=seeding, **options)
+
+    first, second = make_collector(), make_collector()
+    first.step()
+    held = first.step()["action"]
+    with pytest.warns(UserWarning, match="fresh episodes begin"):
+        second.load_state_dict(first.state_dict())
+    assert torch.equal(second.step()["action"], held)
+    first.step()
+    assert not first.in_seed_phase
+    assert first.state_dict()["seed_policy"] is None
+
+
+def test_a_seed_policy_that_is_no_module_has_nothing_to_save():
+    def make_collector() -> StepCollector:
+        env = make_env((5,))
+        random = RandomPolicy(env.action_spec)  # TorchRL's, a plain class
+        return StepCollector(env, random, seed_policy=random, replay_buffer=make_replay(), init_random_frames=9)
+
+    first, second = make_collector(), make_collector()
+    first.step()
+    with pytest.warns(UserWarning, match="fresh episodes begin"):
+        second.load_state_dict(first.state_dict())
+    second.step()
+    assert second.frames == 2
+
+
 @pytest.mark.parametrize("kind", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
 def test_a_collector_that_has_not_acted_can_be_saved_even_if_its_workers_rescale_actions(kind):
     def make_collector() -> StepCollector:

@@ -136,6 +136,18 @@ def test_workers_act_at_random_until_they_get_weights_to_plan_with(started):
     assert workers[0].closed
 
 
+def test_each_worker_holds_random_actions_of_its_own(started):
+    started()
+    learner = learner_of(config_of(replay=TINY["replay"] | {"seed_hold": 1e9}))
+    while learner.collector.in_seed_phase:
+        learner.step()
+    rows = learner.replay[:]
+    actions = [rows["action"][rows["worker"].squeeze(-1) == worker].unique(dim=0) for worker in (0, 1)]
+    assert [len(own) for own in actions] == [1, 1]
+    assert not torch.equal(*actions)
+    learner.collector.shutdown()
+
+
 def test_a_row_says_how_many_updates_older_its_weights_were_than_the_learner_s(started):
     started()
     learner = learner_of(config_of(send_every=20))

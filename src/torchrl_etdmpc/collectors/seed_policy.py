@@ -93,4 +93,5 @@ class SeedPolicy(TensorDictModuleBase):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Holds the action of :meth:`get_extra_state`."""
-        self._held = state["held"]
+        held = state["held"]
+        self._held = None if held is None else held.to(self.action_spec.device)

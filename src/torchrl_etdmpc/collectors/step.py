@@ -291,8 +291,12 @@ class StepCollector(BaseCollector):
             self.env.close(raise_if_closed=raise_on_error)
         self.closed = True
 
+    def _seeding_module(self) -> nn.Module | None:
+        """The seed policy while it acts, if it has a state: TorchRL's ``RandomPolicy`` is no module."""
+        return self.seed_policy if self.in_seed_phase and isinstance(self.seed_policy, nn.Module) else None
+
     def state_dict(self) -> OrderedDict:
-        """Counters, the place inside the running episodes, the simulator's included, and the seed policy's state.
+        """Counters, the place in the running episodes, the simulator's included, and in the seed phase its policy's.
 
         Not the policy's weights. Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)``
         reads them.
@@ -303,7 +307,7 @@ class StepCollector(BaseCollector):
             simulator=simulator_state(self.env),
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
-            seed_policy=None if self.seed_policy is None else self.seed_policy.state_dict(),
+            seed_policy=seeding.state_dict() if (seeding := self._seeding_module()) else None,
         )
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
@@ -314,8 +318,9 @@ class StepCollector(BaseCollector):
         """
         self._frames = state_dict["frames"]
         self._next_trajectory = state_dict["next_trajectory"]
-        if self.seed_policy is not None and state_dict.get("seed_policy"):  # a checkpoint of before has none
-            self.seed_policy.load_state_dict(state_dict["seed_policy"])
+        seeding, held = self._seeding_module(), state_dict.get("seed_policy")  # checkpoints of before have none
+        if seeding is not None and held is not None:
+            seeding.load_state_dict(held)
         self._abandon_episodes()
         if state_dict.get("simulator") is None:
             if self._frames:
