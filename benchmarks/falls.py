@@ -2,9 +2,9 @@
 
     python benchmarks/falls.py
 
-Of every run of the cpu preset, and of what it was before (101 bins, and half the width), the largest fall from the best
-evaluation so far, with its standard error: that of two means of independent episodes, which overstates it where both
-evaluations play the same starts. Writes `benchmarks/results/cpu/falls.csv`.
+Of every run of the cpu preset, and of what it was before (values that were imagined alone; with 101 bins; at half the
+width), the largest fall from the best evaluation so far, with its standard error: that of two means of independent
+episodes, which overstates it where both evaluations play the same starts. Writes `benchmarks/results/cpu/falls.csv`.
 """
 
 from __future__ import annotations
@@ -43,11 +43,18 @@ def largest_fall(curve: pd.DataFrame) -> dict[str, float]:
 
 def main() -> None:
     rows = []
-    for width, bins, folder in ((64, 101, RESULTS / "width-64"), (128, 101, RESULTS / "bins-101"), (128, 21, RESULTS)):
+    presets = (
+        (64, 101, "imagined", RESULTS / "width-64"),
+        (128, 101, "imagined", RESULTS / "bins-101"),
+        (128, 21, "imagined", RESULTS / "imagined"),
+        (128, 21, "replayed", RESULTS),
+    )
+    for width, bins, values, folder in presets:
         for task in sorted(TASKS):
             for seed in SEEDS:
                 curve = pd.read_csv(folder / task / f"seed{seed}" / "eval.csv")
-                rows.append({"width": width, "bins": bins, "task": task, "seed": seed} | largest_fall(curve))
+                name = {"width": width, "bins": bins, "values": values, "task": task, "seed": seed}
+                rows.append(name | largest_fall(curve))
     table = pd.DataFrame(rows)
     table.to_csv(OUT, index=False)
     clear = table[(table["fall"] > 2 * table["standard_error"]) & (table["fall"] > 0.1 * table["from_return"])]

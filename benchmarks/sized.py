@@ -15,7 +15,17 @@ OBSERVATION_DIM, ACTION_DIM = 24, 6  # walker
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 PRESETS = {"thesis": "efficient-tdmpc", "bmpc": "bmpc", "cpu": "cpu"}
 SETTINGS = {"eager": "off", "compiled": "default", "cuda-graph": "auto"}
-FORMER_CPU = ("model.num_bins=101", "planner.num_elites=10", "reanalyze.num_elites=6", "reanalyze.num_slices=6")
+FORMER_CPU = (
+    "model.num_bins=101",
+    "model.normalize_observations=false",
+    "planner.num_elites=10",
+    "reanalyze.num_elites=6",
+    "reanalyze.num_slices=6",
+    "loss.tau=0.03",
+    "loss.value_replayed=0",
+    "loss.value_expectile=0.5",
+    "loss.kl_direction=backward",
+)
 """What the preset ``cpu`` had in earlier measurements, besides its width."""
 COMPILED = ["compiled"] + (["cuda-graph"] if DEVICE.type == "cuda" else [])
 VARIANTS = ["eager", *COMPILED]
