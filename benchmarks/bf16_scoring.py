@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-from cpu_learning import ENV_STEPS, RESULTS, SEEDS, run
+from cpu_learning import RESULTS, SEEDS, run
 from sized import FORMER_CPU
 
 from torchrl_etdmpc.collectors import evaluate
@@ -26,7 +26,7 @@ from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.training import load_agent
 
 FOLDER = RESULTS / "bf16"
-TASK = "walker-stand"
+TASK, ENV_STEPS = "walker-stand", 50_000
 HALF = ("planner.scoring_dtype=bfloat16", "reanalyze.scoring_dtype=bfloat16")
 SIZES = ("model.latent_dim=64", "model.mlp_dim=64", *FORMER_CPU)  # of the runs in float32
 EVERY = 10  # of the states of an evaluation episode are planned from

@@ -1,12 +1,13 @@
-"""Learning runs of the cpu preset: every task and seed, two at a time with one thread each, and a report.
+"""Learning runs of the cpu preset: the experiment `cpu-all`, what is kept of its runs, and reports.
 
-    python benchmarks/cpu_learning.py                        # the committed runs (about three hours on two cores)
+    python benchmarks/cpu_learning.py                 # 28 tasks, 3 seeds, 100,000 env steps: 15 hours on two cores
     python benchmarks/cpu_learning.py --tasks walker-stand --seeds 1
-    python benchmarks/cpu_learning.py --report-only          # from the committed files
+    python benchmarks/cpu_learning.py --report-only   # from the committed files
 
-Writes `benchmarks/results/cpu/<task>/seed<k>/{eval.csv,summary.json}`, `README.md` with budgets and wall times, and
-`report/` with the comparison to published curves, of the six tasks that have three seeds; `untuned_returns.csv` has
-that of the others. Any DMC task may be named. A run that is there already is kept; remove its folder to repeat it.
+Runs stand in `runs/cpu-all`, where `examples/suite.py` goes on with interrupted ones. Of finished ones
+`benchmarks/results/cpu/<task>/seed<k>` gets `eval.csv` and `summary.json`, and `train.csv` where `early_markers.py`
+reads it. `README.md` then has returns and times of all that are there; `report/` sets the six tasks that the preset was
+tuned on beside published curves, `report-easy/` and `report-hard/` those of the benchmark that have runs.
 """
 
 from __future__ import annotations
@@ -19,21 +20,24 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pandas as pd
 
-from torchrl_etdmpc.analysis import read_runs
+from torchrl_etdmpc.analysis import get_benchmark, read_runs
 from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import RunDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
-UNTUNED = RESULTS / "untuned_returns.csv"
+EXPERIMENT = ROOT / "benchmarks" / "experiments" / "cpu-all.yaml"
+RUNS = ROOT / "runs" / "cpu-all"
 TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch", "finger-spin", "walker-walk")
-ENV_STEPS = 50_000
+"""What the preset was tuned on."""
+MARKED = ("walker-walk", "reacher-easy")
+"""Tasks whose ``train.csv`` is kept."""
 SEEDS = (1, 2, 3)
+STEPS = (50_000, 100_000)
 
 
 def run(
@@ -41,12 +45,11 @@ def run(
     seed: int,
     env_steps: int,
     *overrides: str,
+    target: Path,
     preset: str = "cpu",
-    target: Path | None = None,
     keep: Sequence[str] = ("eval", "summary"),
 ) -> str:
     """One run in a process of its own; files of it (``keep``) go to ``target``. Returns a line for the terminal."""
-    target = target or RESULTS / task / f"seed{seed}"
     if RunDirectory(target).finished:
         return f"{task} seed {seed}: already there"
     with tempfile.TemporaryDirectory() as folder:
@@ -62,30 +65,30 @@ def run(
     return result.stdout.strip().splitlines()[-1].split(";")[0] + f" (seed {seed})"
 
 
+def collect(runs: Path) -> None:
+    """Copies what is kept of finished runs."""
+    for summary in sorted(runs.glob("cpu/*/seed*/summary.json")):
+        source = RunDirectory(summary.parent)
+        task, seed = summary.parts[-3:-1]
+        target = RESULTS / task / seed
+        target.mkdir(parents=True, exist_ok=True)
+        for file in (source.eval, source.summary, *([source.train] if task in MARKED else [])):
+            shutil.copy(file, target)
+
+
 def folders(tasks: Sequence[str]) -> list[Path]:
     """Those of the tasks that have committed runs."""
-    found = [
-        RESULTS / task for task in sorted(tasks) if any((RESULTS / task).glob(f"seed*/{RunDirectory('').eval.name}"))
-    ]
+    return [RESULTS / task for task in sorted(tasks) if any((RESULTS / task).glob("seed*/eval.csv"))]
+
+
+def write_report(tasks: Sequence[str], out: Path) -> None:
+    """Runs beside the published curves."""
+    found = folders(tasks)
     if not found:
-        sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
-    return found
-
-
-def report(tasks: Sequence[str], out: Path) -> None:
-    """Runs beside the published curves, up to the budget of these runs."""
-    command = [sys.executable, str(ROOT / "examples" / "report.py"), *map(str, folders(tasks))]
+        return
+    command = [sys.executable, str(ROOT / "examples" / "report.py"), *map(str, found), "--out", str(out)]
     # From 20,000 on, where several baselines were evaluated first: the area before is known of these runs alone.
-    command += ["--budget", str(ENV_STEPS), "--grid-step", "10000", "--grid-start", "20000", "--out", str(out)]
-    subprocess.run(command, check=True)
-
-
-def write_reports() -> None:
-    """The whole report of the six tasks, the returns of the others."""
-    report(TASKS, RESULTS / "report")
-    with tempfile.TemporaryDirectory() as folder:
-        report([task for task in DMC_TASKS if task not in TASKS], Path(folder))
-        shutil.copy(Path(folder) / "returns.csv", UNTUNED)
+    subprocess.run([*command, "--grid-step", "10000", "--grid-start", "20000"], check=True)
 
 
 def write_readme(table: pd.DataFrame) -> None:
@@ -93,58 +96,72 @@ def write_readme(table: pd.DataFrame) -> None:
     lines = [
         "# Learning runs of the cpu preset",
         "",
-        "What `python benchmarks/cpu_learning.py` makes; these were made as the same runs by `examples/suite.py`: the",
-        "tasks with three seeds as the variant *21 bins and more reanalyze* of `cpu-settles` (commit 0e23b41), when",
-        "the preset had other settings, and all others by `cpu-all` (commit cfbf9f5). Two at a time, one thread each,",
-        "with other work beside. Return of the evaluation (mean of 10 episodes, planner without noise) at the end of",
-        "the budget; wall time includes random phase, compilation, evaluations and pauses.",
+        "What `python benchmarks/cpu_learning.py` makes: runs of `benchmarks/experiments/cpu-all.yaml`, two at a time,",
+        "one thread each, with other work beside. Returns are means of evaluations (10 episodes, planner without",
+        "noise) and in brackets those of each seed; minutes include random phase, compilation, evaluations and pauses.",
+        "Tasks that are missing, and missing seeds of three, are not run yet.",
         "",
-        "The preset's settings were chosen on the tasks with three seeds, with these seeds; on no other.",
+        f"The preset's settings were chosen on {', '.join(TASKS[:-1])} and {TASKS[-1]}, with these",
+        "seeds, and on seed 1 of reacher-hard.",
         "",
-        "| task | env steps | seeds | final return: mean (each) | best mean of seeds | wall time, min | decisions/s |",
+        f"| task | seeds | {' | '.join(f'at {step:,}' for step in STEPS)} | best mean | minutes | ms per decision |",
         "|---|---|---|---|---|---|---|",
     ]
     versions = set()
     for task, rows in table.groupby("task"):
         seeds = sorted((RESULTS / task).glob("seed*"))
         summaries = [json.loads(RunDirectory(seed).summary.read_text()) for seed in seeds]
-        finals = [summary["final_return"] for summary in summaries]
         curve = rows.groupby("env_steps").return_mean.mean()
+        cells = []
+        for step in STEPS:
+            values = rows[rows.env_steps == step].sort_values("seed").return_mean
+            each = f" ({', '.join(f'{value:.0f}' for value in values)})" if len(values) > 1 else ""
+            cells.append(f"{values.mean():.0f}{each}" if len(values) else "–")
         walls = sorted(summary["wall_time_s"] / 60 for summary in summaries)
-        speeds = sorted(summary["decisions_per_second"] for summary in summaries)
+        times = sorted(1000 / summary["decisions_per_second"] for summary in summaries)
         versions |= {json.dumps(summary["versions"], sort_keys=True) for summary in summaries}
         lines.append(
-            f"| {task} | {int(rows.env_steps.max())} | {len(finals)} | {sum(finals) / len(finals):.0f} "
-            f"({', '.join(f'{value:.0f}' for value in finals)}) | {curve.max():.0f} at {curve.idxmax():.0f} "
-            f"| {walls[0]:.1f} to {walls[-1]:.1f} | {speeds[0]:.0f} to {speeds[-1]:.0f} |"
+            f"| {task} | {len(seeds)} | {' | '.join(cells)} | {curve.max():.0f} at {curve.idxmax():,.0f} "
+            f"| {_range(walls)} | {_range(times)} |"
         )
-    lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
+    lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + ".", ""]
     lines += [
+        "Beside published curves: [the six tasks that it was tuned on](report/index.md),",
+        "[easy tasks](report-easy/index.md). With the preset's former settings:",
+        "[values that were imagined alone](imagined/README.md), [with 101 bins too](bins-101/README.md),",
+        "[at half the width](width-64/README.md).",
         "",
-        "The tasks with three seeds beside published curves: [report](report/index.md); the others: "
-        "[returns](untuned_returns.csv).",
-        "",
-        "![learning curves](report/curves.png)",
+        "![learning curves](report-easy/curves.png)",
         "",
     ]
     (RESULTS / "README.md").write_text("\n".join(lines))
 
 
+def _range(values: Sequence[float]) -> str:
+    """Lowest to highest, of sorted values."""
+    low, high = f"{values[0]:.0f}", f"{values[-1]:.0f}"
+    return low if low == high else f"{low} to {high}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", default=TASKS, choices=DMC_TASKS, metavar="TASK")
+    parser.add_argument("--tasks", nargs="+", default=DMC_TASKS, choices=DMC_TASKS, metavar="TASK")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
-    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
+    parser.add_argument("--runs", type=Path, default=RUNS, help="folder of the experiment's runs")
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     if not arguments.report_only:
-        with ThreadPoolExecutor(arguments.jobs) as pool:
-            runs = [(task, seed) for seed in arguments.seeds for task in arguments.tasks]
-            for line in pool.map(lambda pair: run(*pair, arguments.env_steps), runs):
-                print(line, flush=True)
-    write_readme(read_runs(folders(DMC_TASKS)))
-    write_reports()
+        command = [sys.executable, str(ROOT / "examples" / "suite.py"), f"experiment={EXPERIMENT}"]
+        command += [f"tasks={','.join(arguments.tasks)}", f"seeds={arguments.seeds}", f"runs_dir={arguments.runs}"]
+        subprocess.run(command, check=True)
+        collect(arguments.runs)
+    found = folders(DMC_TASKS)
+    if not found:
+        sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
+    write_readme(read_runs(found))
+    write_report(TASKS, RESULTS / "report")
+    for level in ("easy", "hard"):
+        write_report(get_benchmark(f"dmc-{level}").tasks, RESULTS / f"report-{level}")
 
 
 if __name__ == "__main__":
