@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import pandas as pd
-from cpu_learning import RESULTS, SEEDS, TASKS
+from cpu_learning import RESULTS, TASKS
 
 OUT = RESULTS / "falls.csv"
 
@@ -51,10 +51,10 @@ def main() -> None:
     )
     for width, bins, values, folder in presets:
         for task in sorted(TASKS):
-            for seed in SEEDS:
-                curve = pd.read_csv(folder / task / f"seed{seed}" / "eval.csv")
+            for path in sorted((folder / task).glob("seed*/eval.csv")):
+                seed = int(path.parent.name.removeprefix("seed"))
                 name = {"width": width, "bins": bins, "values": values, "task": task, "seed": seed}
-                rows.append(name | largest_fall(curve))
+                rows.append(name | largest_fall(pd.read_csv(path)))
     table = pd.DataFrame(rows)
     table.to_csv(OUT, index=False)
     clear = table[(table["fall"] > 2 * table["standard_error"]) & (table["fall"] > 0.1 * table["from_return"])]

@@ -229,7 +229,7 @@ def learned_tasks() -> list[Path]:
 
 def curves() -> str:
     """Expected returns with bands, and minutes, of the committed runs of the cpu preset."""
-    steps = [5_000, 10_000, 20_000, 30_000, 40_000, 50_000]
+    steps = [5_000, 10_000, 20_000, 30_000, 50_000, 100_000]
     text = ["**Return after so many env steps**: mean of the seeds, lowest and highest in brackets.\n"]
     shown, minutes = [], []
     for folder in learned_tasks():
