@@ -165,6 +165,10 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
     return "\n".join(part for part in parts if part)
 
 
+def _tasks(count: int) -> str:
+    return "the one task" if count == 1 else f"the {count} tasks"
+
+
 def _incomplete(lines: Sequence[str]) -> str:
     if not lines:
         return ""
@@ -180,7 +184,7 @@ def _steps(comparison: Comparison) -> str:
     steps = sorted(returns["env_steps"].unique())
     parts = [
         "## Returns at fixed numbers of environment steps\n",
-        f"Mean return over the {len(comparison.tasks)} tasks, best at the last step first; a mean over fewer tasks "
+        f"Mean return over {_tasks(len(comparison.tasks))}, best at the last step first; a mean over fewer tasks "
         "says so, and compares with no other. In square brackets: 95% interval, 1.96 standard errors; in round ones: "
         "seeds; both where they are known. ≈ lies on the straight line between two evaluations of the trained "
         "agent; – was not evaluated there.\n",
