@@ -88,7 +88,8 @@ def write_report(tasks: Sequence[str], out: Path) -> None:
         return
     command = [sys.executable, str(ROOT / "examples" / "report.py"), *map(str, found), "--out", str(out)]
     # From 20,000 on, where several baselines were evaluated first: the area before is known of these runs alone.
-    subprocess.run([*command, "--grid-step", "10000", "--grid-start", "20000"], check=True)
+    command += ["--budget", str(STEPS[-1]), "--grid-step", "10000", "--grid-start", "20000"]
+    subprocess.run(command, check=True)
 
 
 def write_readme(table: pd.DataFrame) -> None:
