@@ -242,8 +242,8 @@ def curves() -> str:
         for step in steps:
             values = by_step[step]
             complete = len(values) == len(runs)
-            band = f"{statistics.mean(values):.0f} [{min(values):.0f}, {max(values):.0f}]" if complete else "–"
-            cells.append(band)
+            band = f" [{min(values):.0f}, {max(values):.0f}]" if len(values) > 1 else ""
+            cells.append(f"{statistics.mean(values):.0f}{band}" if complete else "–")
         name = "gym/Pendulum-v1, half the width" if folder.name == "gym-pendulum" else folder.name
         shown.append([name, len(runs), *cells])
         walls = [summary["wall_time_s"] / 60 for _, summary in runs.values()]
