@@ -115,7 +115,7 @@ def write_readme(table: pd.DataFrame) -> None:
         curve = rows.groupby("env_steps").return_mean.mean()
         cells = []
         for step in STEPS:
-            values = rows[rows.env_steps == step].sort_values("seed").return_mean
+            values = rows.loc[rows["env_steps"] == step, "return_mean"]  # by seed, as read
             each = f" ({', '.join(f'{value:.0f}' for value in values)})" if len(values) > 1 else ""
             cells.append(f"{values.mean():.0f}{each}" if len(values) else "–")
         walls = sorted(summary["wall_time_s"] / 60 for summary in summaries)
