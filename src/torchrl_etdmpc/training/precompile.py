@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import pickle
+import subprocess
+import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from tensordict import TensorDict
@@ -13,14 +17,17 @@ from torchrl.envs import ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.runs import first_line, progress_bar
-from torchrl_etdmpc.training.agent import Agent
+from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
+
+_HELP = "from torchrl_etdmpc.training.precompile import help_to_compile; help_to_compile()"
 
 
 def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]) -> float:
     """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
 
-    With ``compile=auto`` a failure to compile is a warning, and the run goes on without.
+    On a CPU a run of several threads compiles in as many processes, which fill PyTorch's cache for this one. With
+    ``compile=auto`` a failure to compile is a warning, and the run goes on without.
 
     Args:
         config (TrainConfig): the run.
@@ -35,14 +42,32 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
         return 0.0
     torchrl_logger.info("compiling, which takes minutes the first time and seconds from PyTorch's cache later")
     tick, device = time.perf_counter(), agent.device
+    parts = _parts(config, agent, batch, eval_batch)
     calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
+    processes = min(torch.get_num_threads(), len(parts)) if device.type == "cpu" else 1
+    own, *others = ([*parts][first::processes] for first in range(processes))
     try:
-        with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            with progress_bar("compilation", 4 * calls, "parts") as progress:
-                for _ in range(calls):
-                    for call in _everything(config, agent, batch, eval_batch, device):
-                        call()
-                        progress.advance()
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(torch.random.fork_rng([device] if device.type == "cuda" else []))
+            progress = stack.enter_context(progress_bar("compilation", len(parts) * calls, "parts"))
+
+            def call(names: Sequence[str]) -> None:
+                for name in names:
+                    parts[name]()
+                    progress.advance()
+
+            sizes = agent.world_model.observation_dim, agent.world_model.action_dim
+            requests = ((config, *sizes, batch, eval_batch, names) for names in others)
+            helpers = [stack.enter_context(_helper(request)) for request in requests]
+            before = _graphs_not_in_the_cache()
+            call(own)
+            if _graphs_not_in_the_cache() > before:
+                for helper in helpers:
+                    helper.wait()
+            for names in others:
+                call(names)
+            for _ in range(calls - 1):
+                call([*parts])
     except Exception as error:
         if config.compile != "auto":
             raise
@@ -53,11 +78,43 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     return seconds
 
 
-def _everything(
-    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int], device: torch.device
-) -> list[Callable[[], object]]:
+def _graphs_not_in_the_cache() -> int:
+    """Of this process, so far."""
+    return torch._dynamo.utils.counters["inductor"]["fxgraph_cache_miss"]
+
+
+@contextlib.contextmanager
+def _helper(request: tuple[object, ...]) -> Iterator[subprocess.Popen[bytes]]:
+    """A silent process that compiles some parts; what it does not manage to compile is left to this one."""
+    settings = torch.get_num_threads(), torch.get_float32_matmul_precision()  # the cache goes by them too
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen([sys.executable, "-c", _HELP], stdin=subprocess.PIPE, stdout=silent, stderr=silent)
+    try:
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), process.stdin:
+            pickle.dump((settings, request), process.stdin)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def help_to_compile() -> None:
+    """What a helper runs: reads a request of :func:`precompile` from its input."""
+    (threads, precision), (config, *sizes, batch, eval_batch, names) = pickle.load(sys.stdin.buffer)
+    torch.set_num_threads(threads)
+    if precision != torch.get_float32_matmul_precision():  # setting what it is changes what the cache goes by
+        torch.set_float32_matmul_precision(precision)
+    parts = _parts(config, build_agent(config, *sizes), batch, eval_batch)
+    for name in names:
+        parts[name]()
+
+
+def _parts(
+    config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]
+) -> dict[str, Callable[[], object]]:
     """One call of every compiled part, in the shapes of the run."""
-    model = agent.world_model
+    model, device = agent.world_model, agent.device
     observation_dim = model.observation_dim
     assert observation_dim is not None  # training takes vectors
 
@@ -93,4 +150,4 @@ def _everything(
         rows["plan"] = {"loc": action, "scale": action + 1}
         agent.updater.warm_up(TensorDict(rows, slices))
 
-    return [act, reanalyze, evaluate, update]
+    return {"act": act, "reanalyze": reanalyze, "evaluate": evaluate, "update": update}

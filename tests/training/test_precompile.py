@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torchrl_etdmpc.training import build_agent, precompile
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler"
+)
+
+
+@pytest.fixture
+def watched(monkeypatch):
+    """What happens while something precompiles, in order: parts that are called, helpers that are asked and awaited."""
+    events: list[object] = []
+    compiled = []
+
+    class Helper:
+        def wait(self) -> None:
+            events.append("waits")
+
+    @contextlib.contextmanager
+    def helper(request):
+        events.append(("asks for", request[-1]))
+        yield Helper()
+        events.append("ends")
+
+    def part(name):
+        def call() -> None:
+            events.append(name)
+            compiled.append(name)
+
+        return call
+
+    monkeypatch.setattr(precompile, "_helper", helper)
+    monkeypatch.setattr(precompile, "_parts", lambda *_: {name: part(name) for name in "abcd"})
+    monkeypatch.setattr(precompile, "_graphs_not_in_the_cache", lambda: len(compiled))
+    return events
+
+
+@pytest.fixture
+def agent(tiny_config):
+    return build_agent(tiny_config(compile="default"), 5, 1)
+
+
+def run(tiny_config, agent) -> float:
+    return precompile.precompile(tiny_config(compile="default"), agent, (1,), (2,))
+
+
+def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, agent):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    assert run(tiny_config, agent) > 0
+    assert watched == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize(
+    ("threads", "asked", "own"),
+    [(2, ["bd"], "ac"), (3, ["b", "c"], "ad"), (4, ["b", "c", "d"], "a"), (64, ["b", "c", "d"], "a")],
+)
+def test_several_threads_share_the_parts_among_as_many_processes(
+    monkeypatch, watched, tiny_config, agent, threads, asked, own
+):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    run(tiny_config, agent)
+    asks, waits, ends = [("asks for", [*names]) for names in asked], ["waits"] * len(asked), ["ends"] * len(asked)
+    assert watched == [*asks, *own, *waits, *"".join(asked), *ends]
+
+
+def test_nobody_waits_for_helpers_where_the_cache_has_everything(monkeypatch, watched, tiny_config, agent):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(precompile, "_graphs_not_in_the_cache", lambda: 7)
+    run(tiny_config, agent)
+    assert watched == [("asks for", ["b", "d"]), "a", "c", "b", "d", "ends"]
+
+
+def test_a_helper_that_fails_does_so_in_silence_and_leaves_its_parts_to_this_process(capfd):
+    with precompile._helper(("no", "request")) as helper:
+        assert helper.wait(60) == 1
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_helper_ends_with_the_one_that_it_helps(tiny_config):
+    with pytest.raises(KeyboardInterrupt), precompile._helper((tiny_config(), 5, 1, (1,), (2,), [])) as helper:
+        raise KeyboardInterrupt
+    assert helper.poll() is not None
+
+
+_FIND = """
+import pickle, sys
+import torch
+from torchrl_etdmpc.training import build_agent
+from torchrl_etdmpc.training.precompile import _graphs_not_in_the_cache, _helper, _parts
+
+torch.set_num_threads(2)
+config, sizes, batches = pickle.load(sys.stdin.buffer)
+with _helper((config, *sizes, *batches, ["act"])) as helper:
+    assert helper.wait() == 0
+_parts(config, build_agent(config, *sizes), *batches)["act"]()
+print(torch._dynamo.utils.counters["stats"]["unique_graphs"], _graphs_not_in_the_cache())
+"""
+
+
+@needs_compiler
+def test_what_a_helper_compiles_the_process_that_it_helps_finds_in_the_cache(tmp_path, tiny_config):
+    config = tiny_config(compile="default", planner={"horizon": 1, "num_proposals": 0})
+    request = pickle.dumps((config, (5, 1), ((1,), (2,))))
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}  # empty
+    command = [sys.executable, "-c", _FIND]
+    done = subprocess.run(command, input=request, env=environment, capture_output=True, timeout=500, check=True)
+    assert done.stdout.split() == [b"1", b"0"]
