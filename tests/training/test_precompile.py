@@ -57,18 +57,25 @@ def run(tiny_config, agent) -> float:
 
 def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, agent):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
     assert run(tiny_config, agent) > 0
     assert watched == ["a", "b", "c", "d"]
 
 
 @pytest.mark.parametrize(
-    ("threads", "asked", "own"),
-    [(2, ["bd"], "ac"), (3, ["b", "c"], "ad"), (4, ["b", "c", "d"], "a"), (64, ["b", "c", "d"], "a")],
+    ("cores", "asked", "own"),
+    [
+        (None, [], "abcd"),
+        (1, [], "abcd"),
+        (2, ["bd"], "ac"),
+        (3, ["b", "c"], "ad"),
+        (4, ["b", "c", "d"], "a"),
+        (64, ["b", "c", "d"], "a"),
+    ],
 )
-def test_several_threads_share_the_parts_among_as_many_processes(
-    monkeypatch, watched, tiny_config, agent, threads, asked, own
-):
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+def test_with_several_threads_the_cores_share_the_parts(monkeypatch, watched, tiny_config, agent, cores, asked, own):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
     run(tiny_config, agent)
     asks, waits, ends = [("asks for", [*names]) for names in asked], ["waits"] * len(asked), ["ends"] * len(asked)
     assert watched == [*asks, *own, *waits, *"".join(asked), *ends]
@@ -76,6 +83,7 @@ def test_several_threads_share_the_parts_among_as_many_processes(
 
 def test_nobody_waits_for_helpers_where_the_cache_has_everything(monkeypatch, watched, tiny_config, agent):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(precompile, "_graphs_not_in_the_cache", lambda: 7)
     run(tiny_config, agent)
     assert watched == [("asks for", ["b", "d"]), "a", "c", "b", "d", "ends"]

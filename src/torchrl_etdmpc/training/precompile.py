@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import pickle
 import subprocess
 import sys
@@ -26,7 +27,7 @@ _HELP = "from torchrl_etdmpc.training.precompile import help_to_compile; help_to
 def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]) -> float:
     """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
 
-    On a CPU a run of several threads compiles in as many processes, which fill PyTorch's cache for this one. With
+    On a CPU a run of several threads also compiles in further processes, which fill PyTorch's cache for this one. With
     ``compile=auto`` a failure to compile is a warning, and the run goes on without.
 
     Args:
@@ -44,7 +45,8 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     tick, device = time.perf_counter(), agent.device
     parts = _parts(config, agent, batch, eval_batch)
     calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
-    processes = min(torch.get_num_threads(), len(parts)) if device.type == "cpu" else 1
+    several = device.type == "cpu" and torch.get_num_threads() > 1
+    processes = min(os.cpu_count() or 1, len(parts)) if several else 1
     own, *others = ([*parts][first::processes] for first in range(processes))
     try:
         with contextlib.ExitStack() as stack:
