@@ -6,6 +6,7 @@ import csv
 import re
 import runpy
 import shlex
+import statistics
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,7 @@ PAGES = (
     ),
 )
 MEAN = "Mean over tasks"
+CELL = r" (\d+|-) \|"
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in sorted(PAGES)}
 # A block that cannot run by itself is marked as "python fragment".
 BLOCKS = [(page, code) for page, text in TEXTS.items() for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
@@ -233,16 +235,50 @@ def test_the_returns_that_the_pages_compare_are_those_of_the_committed_report():
 
 
 def test_the_returns_of_the_untuned_tasks_are_those_that_are_committed():
-    returns = _returns_at_the_end("imagined/untuned_returns.csv")
+    before, now = _returns_at_the_end("imagined/untuned_returns.csv"), _returns_at_the_end("report-easy/returns.csv")
     methods = ("cpu", "TD-MPC2 (EZ-V2's figure)", "EfficientZero V2", "DR.Q")
-    cell = r" (\d+|-) \|"
-    cells = re.findall(rf"^\| ([a-z-]+) \|{4 * cell}$", TEXTS["docs/results.md"], re.M)
+    (text,) = re.findall(
+        r"^\| task \| `cpu` \(1 seed\) \| `cpu` as it was .*?\n\n", TEXTS["docs/results.md"], re.M | re.S
+    )
+    cells = re.findall(rf"^\| ([a-z-]+) \|{5 * CELL}$", text, re.M)
     rows = {MEAN if task == "mean" else task: values for task, *values in cells}
-    expected = {task: tasks for (method, task), (_, tasks) in returns.items() if method == "cpu"}
+    expected = {task: tasks for (method, task), (_, tasks) in before.items() if method == "cpu"}
     assert rows.keys() == expected.keys() and len(rows) > 1
-    for task, values in rows.items():
-        known = [returns.get((method, task), ("", "")) for method in methods]
+    chosen = "distilled/half expectile 0.7 forward/reacher-hard/seed1"  # with the present settings
+    own = {"reacher-hard": _evaluated(chosen, 50_000)}
+    own |= {task: _evaluated(f"{task}/seed1", 50_000) for task in expected if task not in (MEAN, "reacher-hard")}
+    own[MEAN] = statistics.mean(own.values())
+    for task, (present, *values) in rows.items():
+        known = [before.get((method, task), ("", "")) for method in methods]
         assert values == [value if tasks == expected[task] else "-" for value, tasks in known], task
+        assert present == f"{own[task]:.0f}", task
+        assert task in (MEAN, "reacher-hard") or present == now["cpu", task][0]
+
+
+def test_the_returns_after_twice_as_many_steps_are_those_of_the_committed_report():
+    returns = _returns_at_the_end("report-easy/returns.csv", "100000")
+    methods = ("cpu", "TD-MPC2", "BMPC", "DR.Q", "SimbaV2-UTD8")
+    (text,) = re.findall(r"^\| task \| `cpu` \(1 seed\) \| TD-MPC2 \(3 .*?\n\n", TEXTS["docs/results.md"], re.M | re.S)
+    rows = {task: values for task, *values in re.findall(rf"^\| ([a-z-]+) \|{5 * CELL}$", text, re.M)}
+    means = rows.pop("mean")
+    assert len(rows) == 7
+    for task, values in rows.items():
+        assert values == [returns[method, task][0] for method in methods], task
+    caption = re.search(
+        r"on seven of these at 100,000 (\d+), TD-MPC2 (\d+), BMPC (\d+),\s+SimbaV2 (\d+)", TEXTS["README.md"]
+    )
+    quoted = dict(zip(("cpu", "TD-MPC2", "BMPC", "SimbaV2-UTD8"), caption.groups(), strict=True))
+    for column, method in enumerate(methods):
+        mean = statistics.mean(float(values[column]) for values in rows.values())
+        assert abs(float(means[column]) - mean) < 1
+        assert quoted.get(method, means[column]) == means[column]
+
+
+def _evaluated(run: str, env_steps: int) -> float:
+    """Return of a committed run after so many env steps."""
+    with open(ROOT / "benchmarks" / "results" / "cpu" / run / "eval.csv", newline="", encoding="utf-8") as file:
+        (row,) = (row for row in csv.DictReader(file) if row["env_steps"] == str(env_steps))
+    return float(row["return_mean"])
 
 
 def _means_at_the_end(name: str) -> dict[str, str]:
@@ -251,8 +287,8 @@ def _means_at_the_end(name: str) -> dict[str, str]:
     return {method: value for (method, task), (value, tasks) in returns.items() if (task, tasks) == (MEAN, "6")}
 
 
-def _returns_at_the_end(name: str) -> dict[tuple[str, str], tuple[str, str]]:
-    """Rounded return and number of tasks at 50,000 env steps, by method and task, of a committed table."""
+def _returns_at_the_end(name: str, env_steps: str = "50000") -> dict[tuple[str, str], tuple[str, str]]:
+    """Rounded return and number of tasks after so many env steps, by method and task, of a committed table."""
     with open(ROOT / "benchmarks" / "results" / "cpu" / name, newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["env_steps"] == "50000"]
+        rows = [row for row in csv.DictReader(file) if row["env_steps"] == env_steps]
     return {(row["method"], row["task"]): (f"{float(row['mean']):.0f}", row["tasks"]) for row in rows}
