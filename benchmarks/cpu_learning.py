@@ -100,7 +100,7 @@ def write_readme(table: pd.DataFrame) -> None:
         "What `python benchmarks/cpu_learning.py` makes: runs of `benchmarks/experiments/cpu-all.yaml`, two at a time,",
         "one thread each, with other work beside. Returns are means of evaluations (10 episodes, planner without",
         "noise) and in brackets those of each seed; minutes include random phase, compilation, evaluations and pauses,",
-        "ms per decision pauses too (cheetah-run and hopper-stand waited for some 45 minutes while others were timed).",
+        "ms per decision pauses too: runs far above the others waited while something else was timed.",
         "Tasks that are missing, and missing seeds of three, are not run yet.",
         "",
         f"The preset's settings were chosen on {', '.join(TASKS[:-1])} and {TASKS[-1]}, with these",
