@@ -265,7 +265,8 @@ def test_the_returns_after_twice_as_many_steps_are_those_of_the_committed_report
     for task, values in rows.items():
         assert values == [returns[method, task][0] for method in methods], task
     caption = re.search(
-        r"on seven of these at 100,000 (\d+), TD-MPC2 (\d+), BMPC (\d+),\s+SimbaV2 (\d+)", TEXTS["README.md"]
+        r"on seven of these at 100,000 (\d+), TD-MPC2 (\d+), BMPC (\d+), SimbaV2 (\d+)",
+        " ".join(TEXTS["README.md"].split()),
     )
     quoted = dict(zip(("cpu", "TD-MPC2", "BMPC", "SimbaV2-UTD8"), caption.groups(), strict=True))
     for column, method in enumerate(methods):
