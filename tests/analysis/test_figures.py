@@ -11,6 +11,7 @@ pytest.importorskip("pandas")
 
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
+from matplotlib.collections import LineCollection  # noqa: E402
 from matplotlib.colors import to_hex  # noqa: E402
 from matplotlib.container import BarContainer, ErrorbarContainer  # noqa: E402
 
@@ -121,6 +122,31 @@ def test_quoted_points_are_hollow_markers_that_nothing_joins_and_stand_in_the_le
     assert (list(line.get_xdata()), list(line.get_ydata())) == ([20_000, 40_000], [5.0, 7.0])
     assert line.get_linestyle() == "None"
     assert all(len(line.get_xdata()) == 0 for lines in hollow[1:] for line in lines)
+    assert "paper, quoted" in legend_colors(figure)
+
+
+def test_an_aggregate_of_one_evaluation_is_a_marker_with_its_interval():
+    table = estimates(5.0, tasks=TASKS[:1])
+    table = table[(table["method"] != METHODS[1]) | table["env_steps"].isin([0, 80_000])]  # as BMPC's every 100,000
+    figure = plot_aggregate(table, methods=METHODS, budget=BUDGET, ylabel="y")
+    (axis,), height = figure.axes, 10 + 80
+    assert len(drawn_lines(axis)) == len(METHODS) - 1
+    (marker,) = drawn_markers(axis)
+    assert (list(marker.get_xdata()), list(marker.get_ydata())) == ([80_000], [height])
+    (bar,) = (bars.get_segments()[0] for bars in axis.collections if isinstance(bars, LineCollection))
+    np.testing.assert_allclose(bar, [[80_000, height - 9.8], [80_000, height + 9.8]])
+    assert {to_hex(marker.get_color())} == {legend_colors(figure)[METHODS[1]]}
+
+
+def test_quoted_aggregates_are_hollow_markers_up_to_the_budget():
+    points = pd.DataFrame(
+        {"method": "paper", "env_steps": [40_000, 80_000, BUDGET + 1], "mean": [0.5, np.nan, 0.7]}  # a task is missing
+    )
+    table = estimates(tasks=TASKS[:1])
+    figure = plot_aggregate(table, methods=METHODS, budget=BUDGET, ylabel="y", points=points)
+    (line,) = drawn_markers(figure.axes[0])
+    assert (list(line.get_xdata()), list(line.get_ydata())) == ([40_000], [0.5])
+    assert line.get_markerfacecolor() == "none"
     assert "paper, quoted" in legend_colors(figure)
 
 

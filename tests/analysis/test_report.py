@@ -22,7 +22,9 @@ FIGURES = {"curves", "aggregate", "auc"}
 FILES = TEXTS | {f"{name}.png" for name in FIGURES}
 
 
-def comparison(*, seeds: int = 2, height: float = 1.0, short: bool = False) -> Comparison:
+def comparison(
+    *, seeds: int = 2, height: float = 1.0, short: bool = False, points: pd.DataFrame | None = None
+) -> Comparison:
     """Ours with some seeds, which may end early on walker-run, beside BMPC's straight lines to 100."""
     ours = [
         ("ours", task, seed, step, height * (seed + step / 2000))
@@ -36,6 +38,7 @@ def comparison(*, seeds: int = 2, height: float = 1.0, short: bool = False) -> C
         pd.DataFrame(bmpc, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"]),
         benchmark=get_benchmark("dmc-easy"),
         tasks=TASKS,
+        points=points,
     )
 
 
@@ -203,3 +206,20 @@ def test_methods_known_per_seed_on_all_tasks_have_an_interquartile_mean_on_the_p
     (row,) = re.findall(r"^\| ours \| ([\d.]+) \(([\d.]+) to ([\d.]+)\) \|  \| 2 \|$", page, re.MULTILINE)
     assert np.array(row, float) == pytest.approx([1.005, 1.0, 1.01])
     assert "Interquartile mean" not in write_report(comparison(short=True), tmp_path / "other").read_text("utf-8")
+
+
+def test_quoted_means_stand_in_the_aggregate_where_every_task_has_one(monkeypatch, tmp_path):
+    rows = [("paper", task, 50_000, value, "s") for task, value in zip(TASKS, (20.0, 60.0), strict=True)]
+    rows += [("paper", TASKS[0], 100_000, 90.0, "s")]
+    quoted = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "source"])
+    drawn: list[pd.DataFrame] = []
+
+    def plot(aggregates: pd.DataFrame, *, points: pd.DataFrame, **options) -> Figure:
+        drawn.append(points.dropna(subset="mean"))
+        return Figure()
+
+    monkeypatch.setattr("torchrl_etdmpc.analysis.report.plot_aggregate", plot)
+    write_report(comparison(points=quoted), tmp_path)
+    (points,) = drawn
+    # BMPC's return at 200,000, which normalises, is 100 on both.
+    assert points[["method", "env_steps", "mean"]].to_numpy().tolist() == [["paper", 50_000, pytest.approx(0.4)]]

@@ -171,14 +171,23 @@ def plot_curves(
     return figure
 
 
-def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: float, ylabel: str) -> Figure:
-    """Aggregate normalised curves with shaded 95% intervals.
+def plot_aggregate(
+    aggregates: pd.DataFrame,
+    *,
+    methods: Sequence[str],
+    budget: float,
+    ylabel: str,
+    points: pd.DataFrame | None = None,
+) -> Figure:
+    """Aggregate normalised curves with shaded 95% intervals; a single value is a marker with its interval.
 
     Args:
         aggregates (DataFrame): see :func:`torchrl_etdmpc.analysis.aggregate`.
         methods (sequence of str): in the order of the legend.
         budget (float): right end of the axis, env steps.
         ylabel (str): what the values are.
+        points (DataFrame, optional): quoted aggregates ``method, env_steps, mean``, drawn as hollow markers that no
+            line joins.
 
     >>> from torchrl_etdmpc.analysis import AGGREGATE
     >>> curve = pd.DataFrame({"method": "ours", "task": AGGREGATE, "env_steps": [0, 10, 20], "mean": [0.0, 0.5, 1.0]})
@@ -186,19 +195,33 @@ def plot_aggregate(aggregates: pd.DataFrame, *, methods: Sequence[str], budget: 
     >>> plot_aggregate(curve, methods=["ours"], budget=20, ylabel="normalised return").axes[0].get_ylabel()
     'normalised return'
     """
-    drawn = set(aggregates.dropna(subset="mean")["method"])
-    named = [method for method in methods if method in drawn]
-    legend = _legend_columns(named, 4.8)
-    figure = Figure(figsize=(4.8, 3.0 + 0.2 * -(-len(named) // legend)), layout="constrained")
+    points = no_points() if points is None else points[points["env_steps"] <= budget].dropna(subset="mean")
+    quoted = list(dict.fromkeys(points["method"]))
+    trained = aggregates[aggregates["env_steps"] > 0].dropna(subset="mean")
+    trained = trained[trained.groupby("method")["env_steps"].transform("min") <= budget]
+    named = [method for method in methods if method in set(trained["method"])]
+    names = [*named, *(f"{name}, quoted" for name in quoted)]
+    width = 6.4 if len(names) > 6 else 4.8
+    legend = _legend_columns(names, width)
+    figure = Figure(figsize=(width, 3.0 + 0.2 * -(-len(names) // legend)), layout="constrained")
     axis = figure.subplots()
-    styles = method_styles(methods)
-    for method in methods:
-        curve = aggregates[aggregates["method"] == method].assign(task="aggregate")
-        _line(axis, curve, styles[method], budget)
+    styles = method_styles([*methods, *quoted])
+    unclipped = {"clip_on": False, "in_layout": False}
+    for method in named:
+        curve, style = trained[trained["method"] == method], styles[method]
+        if len(curve) > 1:
+            _line(axis, curve.assign(task="aggregate"), style, budget)
+        else:
+            half = Z_95 * curve["standard_error"].fillna(0)
+            look = {"color": style["color"], "marker": style["marker"], "markersize": 4, "elinewidth": 1}
+            axis.errorbar(curve["env_steps"], curve["mean"], yerr=half, linestyle="none", **look, **unclipped)
+    for method in quoted:
+        here = points[points["method"] == method]
+        axis.plot(here["env_steps"], here["mean"], **_hollow(styles[method]), markersize=5, **unclipped)
     _dress(axis, budget)
     axis.set_xlabel("environment steps")
     axis.set_ylabel(ylabel)
-    _legend(figure, named, styles, columns=legend)
+    _legend(figure, named, styles, columns=legend, quoted=quoted)
     return figure
 
 

@@ -120,11 +120,13 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     steps = np.unique(comparison.estimates["env_steps"])
     steps = np.union1d(steps[(steps >= comparison.grid[0]) & (steps <= comparison.budget)], comparison.grid)
     curves = aggregate(normalise(interpolate(comparison.estimates, steps), comparison.constants), comparison.tasks)
+    points = comparison.points.assign(standard_error=np.nan, seeds=np.nan)
+    points = aggregate(normalise(points, comparison.constants), comparison.tasks)
     areas = comparison.areas[comparison.areas["task"] == AGGREGATE]
     options = {"methods": comparison.methods, "budget": comparison.budget}
     return {
         "curves": plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options),
-        "aggregate": plot_aggregate(curves, ylabel=normalised, **options),
+        "aggregate": plot_aggregate(curves, ylabel=normalised, points=points, **options),
         "auc": plot_auc(areas, methods=comparison.methods, ylabel="normalised AUC"),
     }
 
