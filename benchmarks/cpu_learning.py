@@ -6,8 +6,9 @@
 
 Runs stand in `runs/cpu-all`, where `examples/suite.py` goes on with interrupted ones. Of finished ones
 `benchmarks/results/cpu/<task>/seed<k>` gets `eval.csv` and `summary.json`, and `train.csv` where `early_markers.py`
-reads it. `README.md` then has returns and times of all that are there; `report/` sets the six tasks that the preset was
-tuned on beside published curves, `report-easy/` and `report-hard/` those of the benchmark that have runs.
+reads it. `report/` sets the six tasks that the preset was tuned on beside published curves, `report-easy/` and
+`report-hard/` those of the benchmark that have runs. `README.md` then has returns and times of all that are there, and
+means over the easy tasks that it was tuned on and over the others, beside baselines.
 """
 
 from __future__ import annotations
@@ -92,6 +93,43 @@ def write_report(tasks: Sequence[str], out: Path) -> None:
     subprocess.run(command, check=True)
 
 
+def beside_baselines(returns: pd.DataFrame) -> list[str]:
+    """Means over the tasks that the preset was tuned on, over the others and over all, as lines of Markdown.
+
+    Args:
+        returns (DataFrame): ``returns.csv`` of a report. At each number of env steps the tasks are those on which the
+            preset has a return; a method that lacks one of them has no mean.
+    """
+    rows = returns[returns["tasks"] == 1]
+    groups = {}
+    for step in STEPS:
+        tasks = rows.loc[(rows["method"] == "cpu") & (rows["env_steps"] == step), "task"]
+        tuned = tasks.isin(TASKS)
+        for name, chosen in (("tuned", tasks[tuned]), ("others", tasks[~tuned]), ("all", tasks)):
+            if len(chosen):
+                groups[f"{step:,}: {len(chosen)} {name}"] = rows[rows["env_steps"].eq(step) & rows["task"].isin(chosen)]
+    lines = {}
+    for method, kinds in rows.groupby("method", sort=False)["kind"]:
+        cells = []
+        for group in groups.values():
+            own = group[group["method"] == method]
+            if len(own) < group["task"].nunique():
+                cells.append("–")
+                continue
+            mean, half = own["mean"].mean(), 1.96 * own["standard_error"].pow(2).sum(skipna=False) ** 0.5 / len(own)
+            cell = f"{'≈ ' if own['kind'].eq('interpolated').any() else ''}{mean:.0f}"
+            cells.append(cell if pd.isna(half) else f"{cell} [{mean - half:.0f}, {mean + half:.0f}]")
+            place = -mean  # ends as that over all tasks at the last step
+        if set(cells) != {"–"}:
+            row = f"| {method}{' (quoted)' if kinds.eq('quoted').all() else ''} | {' | '.join(cells)} |"
+            lines[row] = (0.0 if cells[-1] == "–" else place, method)
+    return [
+        f"| mean return at | {' | '.join(groups)} |",
+        "|---" * (1 + len(groups)) + "|",
+        *sorted(lines, key=lines.get),
+    ]
+
+
 def write_readme(table: pd.DataFrame) -> None:
     """A table of returns, budgets and wall times."""
     lines = [
@@ -128,6 +166,14 @@ def write_readme(table: pd.DataFrame) -> None:
         )
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + ".", ""]
     lines += [
+        "Beside baselines, the easy tasks that are run so far: those that the preset was tuned on, the others, and",
+        "all. In brackets 95% intervals, where seeds are known; ≈ where a task is between two evaluations; a method",
+        "that was not evaluated on one of the tasks at that number of env steps has no mean there.",
+        "",
+        *beside_baselines(pd.read_csv(RESULTS / "report-easy" / "returns.csv")),
+        "",
+    ]
+    lines += [
         "Beside published curves: [the six tasks that it was tuned on](report/index.md),",
         "[easy tasks](report-easy/index.md). With the preset's former settings:",
         "[values that were imagined alone](imagined/README.md), [with 101 bins too](bins-101/README.md),",
@@ -160,10 +206,10 @@ def main() -> None:
     found = folders(DMC_TASKS)
     if not found:
         sys.exit(f"error: no runs under {RESULTS}; run this script without --report-only first.")
-    write_readme(read_runs(found))
     write_report(TASKS, RESULTS / "report")
     for level in ("easy", "hard"):
         write_report(get_benchmark(f"dmc-{level}").tasks, RESULTS / f"report-{level}")
+    write_readme(read_runs(found))
 
 
 if __name__ == "__main__":

@@ -181,6 +181,42 @@ def test_the_largest_falls_are_those_of_the_committed_curves(monkeypatch, tmp_pa
         assert f"{found}| {fall} | {error} | {last} |" in study
 
 
+def test_means_beside_baselines_are_over_the_tasks_that_were_run(monkeypatch):
+    pd = pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    beside_baselines = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))["beside_baselines"]
+    evaluated = [
+        *(("cpu", task, value, None) for task, value in (("walker-walk", 100), ("cup-catch", 300), ("walker-run", 50))),
+        *(("whole", task, value, 10) for task, value in (("walker-walk", 10), ("cup-catch", 20), ("walker-run", 30))),
+        ("lacks one", "walker-run", 60, 5),
+        ("whole", "fish-swim", 999, 1),  # which the preset was not run on
+    ]
+    rows = [("evaluated", 1, 50_000, *row) for row in evaluated]
+    rows += [("quoted", 1, 50_000, "paper", task, 40, None) for task in ("walker-walk", "cup-catch", "walker-run")]
+    rows += [
+        ("interpolated", 1, 100_000, "whole", "walker-run", 7, 2),
+        ("evaluated", 1, 100_000, "cpu", "walker-run", 8, None),
+    ]
+    rows += [("evaluated", 3, 50_000, "cpu", "Mean over tasks", 999, None)]
+    columns = ["kind", "tasks", "env_steps", "method", "task", "mean", "standard_error"]
+    assert beside_baselines(pd.DataFrame(rows, columns=columns)) == [
+        "| mean return at | 50,000: 2 tuned | 50,000: 1 others | 50,000: 3 all | 100,000: 1 others | 100,000: 1 all |",
+        "|---|---|---|---|---|---|",
+        "| cpu | 200 | 50 | 150 | 8 | 8 |",
+        "| whole | 15 [1, 29] | 30 [10, 50] | 20 [9, 31] | ≈ 7 [3, 11] | ≈ 7 [3, 11] |",
+        "| lacks one | – | 60 [50, 70] | – | – | – |",
+        "| paper (quoted) | 40 | 40 | 40 | – | – |",
+    ]
+
+
+def test_the_means_beside_baselines_are_those_of_the_committed_report(monkeypatch):
+    pd = pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    script = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))
+    lines = script["beside_baselines"](pd.read_csv(script["RESULTS"] / "report-easy" / "returns.csv"))
+    assert "\n".join(lines) in (script["RESULTS"] / "README.md").read_text(encoding="utf-8")
+
+
 def test_the_commands_explain_themselves(generate):
     from torchrl_etdmpc.commands import _COMMANDS
 
