@@ -157,7 +157,8 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
         files["final.md"],
         "## Learning curves\n",
         "Mean over seeds; shaded: 95% interval, 1.96 standard errors. A line begins at the first evaluation of the "
-        "trained agent; a marker at 0 is the untrained one. Hollow markers are quoted, and belong to no line.\n",
+        "trained agent; a marker at 0 is the untrained one. Hollow markers are quoted, and belong to no line. The "
+        "aggregate has what is known on every task; a single value is a marker with its interval.\n",
         "![learning curves](curves.png)\n\n![aggregate](aggregate.png)\n",
         _intervals(comparison),
         _robust(comparison),
