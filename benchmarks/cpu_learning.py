@@ -8,7 +8,7 @@ Runs stand in `runs/cpu-all`, where `examples/suite.py` goes on with interrupted
 `benchmarks/results/cpu/<task>/seed<k>` gets `eval.csv` and `summary.json`, and `train.csv` where `early_markers.py`
 reads it. `report/` sets the six tasks that the preset was tuned on beside published curves, `report-easy/` and
 `report-hard/` those of the benchmark that have runs. `README.md` then has returns and times of all that are there, and
-means over the easy tasks that it was tuned on and over the others, beside baselines.
+`docs/results.md` means over the easy tasks that it was tuned on and over the others, beside baselines.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from torchrl_etdmpc.runs import RunDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "cpu"
+PAGE = ROOT / "docs" / "results.md"
 EXPERIMENT = ROOT / "benchmarks" / "experiments" / "cpu-all.yaml"
 RUNS = ROOT / "runs" / "cpu-all"
 TASKS = ("walker-stand", "reacher-easy", "cartpole-swingup", "cup-catch", "finger-spin", "walker-walk")
@@ -121,7 +122,8 @@ def beside_baselines(returns: pd.DataFrame) -> list[str]:
             cells.append(cell if pd.isna(half) else f"{cell} [{mean - half:.0f}, {mean + half:.0f}]")
             place = -mean  # ends as that over all tasks at the last step
         if set(cells) != {"–"}:
-            row = f"| {method}{' (quoted)' if kinds.eq('quoted').all() else ''} | {' | '.join(cells)} |"
+            name = "**cpu**" if method == "cpu" else method
+            row = f"| {name}{' (quoted)' if kinds.eq('quoted').all() else ''} | {' | '.join(cells)} |"
             lines[row] = (0.0 if cells[-1] == "–" else place, method)
     return [
         f"| mean return at | {' | '.join(groups)} |",
@@ -166,16 +168,9 @@ def write_readme(table: pd.DataFrame) -> None:
         )
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + ".", ""]
     lines += [
-        "Beside baselines, the easy tasks that are run so far: those that the preset was tuned on, the others, and",
-        "all. In brackets 95% intervals, where seeds are known; ≈ where a task is between two evaluations; a method",
-        "that was not evaluated on one of the tasks at that number of env steps has no mean there.",
-        "",
-        *beside_baselines(pd.read_csv(RESULTS / "report-easy" / "returns.csv")),
-        "",
-    ]
-    lines += [
-        "Beside published curves: [the six tasks that it was tuned on](report/index.md),",
-        "[easy tasks](report-easy/index.md). With the preset's former settings:",
+        "Beside published curves: [means](../../../docs/results.md#what-the-cpu-preset-is-worth),",
+        "[the six tasks that it was tuned on](report/index.md), [easy tasks](report-easy/index.md).",
+        "With the preset's former settings:",
         "[values that were imagined alone](imagined/README.md), [with 101 bins too](bins-101/README.md),",
         "[at half the width](width-64/README.md).",
         "",
@@ -183,6 +178,14 @@ def write_readme(table: pd.DataFrame) -> None:
         "",
     ]
     (RESULTS / "README.md").write_text("\n".join(lines))
+
+
+def write_means(returns: pd.DataFrame) -> None:
+    """The table of :func:`beside_baselines` into the page on results."""
+    begin, end = "<!-- means: written by benchmarks/cpu_learning.py -->\n", "<!-- end -->"
+    head, rest = PAGE.read_text(encoding="utf-8").split(begin)
+    table = "\n".join(beside_baselines(returns))
+    PAGE.write_text(f"{head}{begin}{table}\n{rest[rest.index(end) :]}", encoding="utf-8")
 
 
 def _range(values: Sequence[float]) -> str:
@@ -210,6 +213,7 @@ def main() -> None:
     for level in ("easy", "hard"):
         write_report(get_benchmark(f"dmc-{level}").tasks, RESULTS / f"report-{level}")
     write_readme(read_runs(found))
+    write_means(pd.read_csv(RESULTS / "report-easy" / "returns.csv"))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,6 @@ PAGES = (
     ),
 )
 MEAN = "Mean over tasks"
-CELL = r" (\d+|-) \|"
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in sorted(PAGES)}
 # A block that cannot run by itself is marked as "python fragment".
 BLOCKS = [(page, code) for page, text in TEXTS.items() for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
@@ -219,60 +218,56 @@ def test_the_columns_that_the_docs_name_are_those_of_a_run():
     assert [column for column in EVAL_COLUMNS if f"`{column}`" not in TEXTS["docs/running.md"]] == []
 
 
-def test_the_returns_that_the_pages_compare_are_those_of_the_committed_report():
-    found = _means_at_the_end("report/returns.csv") | {
-        "`cpu` as it was": _means_at_the_end("imagined/report/returns.csv")["cpu"]
-    }
-    names = {"TD-MPC2": "TD-MPC2 (EZ-V2's figure)", "this": "cpu", "this, `cpu`": "cpu"}
-    caption = re.search(
-        r"Mean return of the six tasks at 50,000 env steps: (.*?) if it counts", TEXTS["README.md"], re.S
-    )[1]
-    quoted = re.findall(r"([A-Z][\w.-]+(?: V2)?|this) (\d{3})\b", caption)
-    table = re.findall(r"^\| ([^|]+) \| (\d{3})\b(?! and)[^|]*\| [^|]+ \|$", TEXTS["docs/results.md"], re.M)
-    assert len(quoted) == 6 and len(table) == 9
-    for method, value in (*quoted, *table):
-        assert value == found[{**names, "DreamerV3": "DreamerV3 (author)"}.get(method, method)], method
+def test_the_means_of_the_readme_are_those_of_the_table():
+    table, caption = _table_of_means(), " ".join(TEXTS["README.md"].split())
+    early = {method: returns["50,000", "all"] for method, returns in table.items()}
+    late = {method: returns["100,000", "all"] for method, returns in table.items()}
+    tuned, others = ({name: returns["50,000", kind] for name, returns in table.items()} for kind in ("tuned", "others"))
+    figure = tuned["TD-MPC2 (EZ-V2's figure)"]
+    for text in (
+        f"Mean return of these at 50,000 env steps: this {early['cpu']}, EfficientZero V2 {early['EfficientZero V2']} "
+        f"(read off a figure), DR.Q {early['DR.Q']}, DC-MPC {early['DC-MPC']}; FoG {early['FoG']} if it counts",
+        f": this {late['cpu']}, SimbaV2 at UTD 8 {late['SimbaV2-UTD8']}, DR.Q {late['DR.Q']}, BMPC {late['BMPC']}, "
+        f"TD-MPC2 {late['TD-MPC2']}.",
+        f"on them it has {tuned['cpu']} at 50,000, TD-MPC2 {figure} (read off",
+        f"others {others['cpu']}, DR.Q {others['DR.Q']} (",
+    ):
+        assert text in caption
 
 
-def test_the_returns_of_the_untuned_tasks_are_those_that_are_committed():
-    before, now = _returns_at_the_end("imagined/untuned_returns.csv"), _returns_at_the_end("report-easy/returns.csv")
-    methods = ("cpu", "TD-MPC2 (EZ-V2's figure)", "EfficientZero V2", "DR.Q")
-    (text,) = re.findall(
-        r"^\| task \| `cpu` \(1 seed\) \| `cpu` as it was .*?\n\n", TEXTS["docs/results.md"], re.M | re.S
-    )
-    cells = re.findall(rf"^\| ([a-z-]+) \|{5 * CELL}$", text, re.M)
-    rows = {MEAN if task == "mean" else task: values for task, *values in cells}
-    expected = {task: tasks for (method, task), (_, tasks) in before.items() if method == "cpu"}
-    assert rows.keys() == expected.keys() and len(rows) > 1
-    chosen = "distilled/half expectile 0.7 forward/reacher-hard/seed1"  # with the present settings
-    own = {"reacher-hard": _evaluated(chosen, 50_000)}
-    own |= {task: _evaluated(f"{task}/seed1", 50_000) for task in expected if task not in (MEAN, "reacher-hard")}
-    own[MEAN] = statistics.mean(own.values())
-    for task, (present, *values) in rows.items():
-        known = [before.get((method, task), ("", "")) for method in methods]
-        assert values == [value if tasks == expected[task] else "-" for value, tasks in known], task
-        assert present == f"{own[task]:.0f}", task
-        assert task in (MEAN, "reacher-hard") or present == now["cpu", task][0]
-
-
-def test_the_returns_after_twice_as_many_steps_are_those_of_the_committed_report():
+def test_the_returns_of_single_tasks_are_those_of_the_committed_report():
     returns = _returns_at_the_end("report-easy/returns.csv", "100000")
-    methods = ("cpu", "TD-MPC2", "BMPC", "DR.Q", "SimbaV2-UTD8")
-    (text,) = re.findall(r"^\| task \| `cpu` \(1 seed\) \| TD-MPC2 \(3 .*?\n\n", TEXTS["docs/results.md"], re.M | re.S)
-    rows = {task: values for task, *values in re.findall(rf"^\| ([a-z-]+) \|{5 * CELL}$", text, re.M)}
-    means = rows.pop("mean")
-    assert len(rows) == 7
-    for task, values in rows.items():
-        assert values == [returns[method, task][0] for method in methods], task
-    caption = re.search(
-        r"on seven of these at 100,000 (\d+), TD-MPC2 (\d+), BMPC (\d+), SimbaV2 (\d+)",
-        " ".join(TEXTS["README.md"].split()),
-    )
-    quoted = dict(zip(("cpu", "TD-MPC2", "BMPC", "SimbaV2-UTD8"), caption.groups(), strict=True))
-    for column, method in enumerate(methods):
-        mean = statistics.mean(float(values[column]) for values in rows.values())
-        assert abs(float(means[column]) - mean) < 1
-        assert quoted.get(method, means[column]) == means[column]
+    (text,) = re.findall(r"\*\*By task\*\*, at 100,000 env steps\.(.*?)\n\n", TEXTS["docs/results.md"], re.S)
+    quoted = re.findall(r"([a-z-]+)\s(\d+) \(([^)]*)\)", text)
+    assert len(quoted) > 4
+    for task, own, others in quoted:
+        assert returns["cpu", task][0] == own, task
+        for method, value in re.findall(r"([\w.-]+) (\d+)", others):
+            assert returns[method, task][0] == value, (method, task)
+
+
+def test_the_means_with_former_settings_are_those_that_are_committed():
+    (text,) = re.findall(r"\*\*With former settings\*\*(.*?)\n\n", TEXTS["docs/results.md"], re.S)
+    six = [path.name for path in (ROOT / "benchmarks" / "results" / "cpu" / "width-64").glob("*-*")]
+    for place, former in enumerate(("imagined", "bins-101", "width-64")):
+        mean = statistics.mean(_evaluated(f"{former}/{task}/seed{seed}", 50_000) for task in six for seed in (1, 2, 3))
+        assert re.findall(r"(\d{3}) \[", text)[place] == f"{mean:.0f}", former
+    returns = _returns_at_the_end("imagined/untuned_returns.csv")
+    tasks = [task for method, task in returns if method == "cpu" and task != MEAN]
+    now = statistics.mean(_evaluated(f"{task}/seed1", 50_000) for task in tasks)
+    former, count = returns["cpu", MEAN]
+    assert (count, len(tasks)) == ("8", 8)
+    assert f"{former} on eight others, where the preset has {now:.0f}" in " ".join(text.split())
+
+
+def _table_of_means() -> dict[str, dict[tuple[str, str], str]]:
+    """Mean returns on the page on results, by method, number of env steps and kind of tasks."""
+    (text,) = re.findall(r"<!-- means: .*?-->\n(.*?)\n<!-- end -->", TEXTS["docs/results.md"], re.S)
+    heads, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.split("\n")]
+    columns = [re.fullmatch(r"([\d,]+): \d+ (\w+)", head).groups() for head in heads[1:]]
+    values = [[cell.removeprefix("\u2248 ").split(" ")[0] for cell in row[1:]] for row in rows]
+    methods = [row[0].removesuffix(" (quoted)").strip("*") for row in rows]
+    return {method: dict(zip(columns, numbers, strict=True)) for method, numbers in zip(methods, values, strict=True)}
 
 
 def _evaluated(run: str, env_steps: int) -> float:
@@ -280,12 +275,6 @@ def _evaluated(run: str, env_steps: int) -> float:
     with open(ROOT / "benchmarks" / "results" / "cpu" / run / "eval.csv", newline="", encoding="utf-8") as file:
         (row,) = (row for row in csv.DictReader(file) if row["env_steps"] == str(env_steps))
     return float(row["return_mean"])
-
-
-def _means_at_the_end(name: str) -> dict[str, str]:
-    """Rounded mean return over the six tasks at 50,000 env steps, by method, of a committed table."""
-    returns = _returns_at_the_end(name)
-    return {method: value for (method, task), (value, tasks) in returns.items() if (task, tasks) == (MEAN, "6")}
 
 
 def _returns_at_the_end(name: str, env_steps: str = "50000") -> dict[tuple[str, str], tuple[str, str]]:

@@ -202,7 +202,7 @@ def test_means_beside_baselines_are_over_the_tasks_that_were_run(monkeypatch):
     assert beside_baselines(pd.DataFrame(rows, columns=columns)) == [
         "| mean return at | 50,000: 2 tuned | 50,000: 1 others | 50,000: 3 all | 100,000: 1 others | 100,000: 1 all |",
         "|---|---|---|---|---|---|",
-        "| cpu | 200 | 50 | 150 | 8 | 8 |",
+        "| **cpu** | 200 | 50 | 150 | 8 | 8 |",
         "| whole | 15 [1, 29] | 30 [10, 50] | 20 [9, 31] | ≈ 7 [3, 11] | ≈ 7 [3, 11] |",
         "| lacks one | – | 60 [50, 70] | – | – | – |",
         "| paper (quoted) | 40 | 40 | 40 | – | – |",
@@ -214,7 +214,7 @@ def test_the_means_beside_baselines_are_those_of_the_committed_report(monkeypatc
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     script = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))
     lines = script["beside_baselines"](pd.read_csv(script["RESULTS"] / "report-easy" / "returns.csv"))
-    assert "\n".join(lines) in (script["RESULTS"] / "README.md").read_text(encoding="utf-8")
+    assert "\n".join(lines) in script["PAGE"].read_text(encoding="utf-8")
 
 
 def test_the_commands_explain_themselves(generate):
