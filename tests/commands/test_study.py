@@ -26,22 +26,26 @@ NAMES = [name for name in get_args(StudyName) if name != "all"]
 FEW = ("episodes=2", "states=6", "device=cpu", "seed=4")
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory) -> Path:
-    """An untrained agent of small networks, whose episodes have 30 decisions."""
+def untrained(folder: Path, *, num_dynamics: int) -> Path:
+    """An agent of small networks, whose episodes have 30 decisions."""
     config = TrainConfig.from_dict(
         {
             "task": "cartpole-balance",
             "episode_length": 60,
             "compile": "off",
-            "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": 2},
+            "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": num_dynamics},
             "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
             "reanalyze": {"num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
         }
     )
     torch.manual_seed(0)
     agent = build_agent(config, observation_dim=5, action_dim=1)
-    return save_agent(tmp_path_factory.mktemp("run") / "last.pt", agent, config, {"env_steps": 400})
+    return save_agent(folder / "last.pt", agent, config, {"env_steps": 400})
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> Path:
+    return untrained(tmp_path_factory.mktemp("run"), num_dynamics=2)
 
 
 @pytest.fixture
@@ -144,6 +148,17 @@ def test_a_mistake_is_one_line(study, arguments, error):
     assert str(message).startswith(error)
     assert "\n" not in str(message)
     assert (out, err) == ("", "")
+
+
+def test_what_an_agent_of_one_head_cannot_show_is_left_out_and_said(study, tmp_path):
+    checkpoint = untrained(tmp_path, num_dynamics=1)
+    message, out, _ = study("all", f"checkpoint={checkpoint}", *FEW)
+    assert message is None
+    assert "calibration: left out: num_dynamics must be at least 2 for heads to disagree, got 1." in out.splitlines()
+    written = {path.stem for path in Path().rglob("*.json")}
+    assert written == set(NAMES) - {"calibration"}
+    message, _, _ = study("calibration", f"checkpoint={checkpoint}", *FEW)
+    assert str(message) == "error: num_dynamics must be at least 2 for heads to disagree, got 1."
 
 
 def test_an_agent_of_another_task_is_refused(checkpoint, study):

@@ -213,10 +213,17 @@ def test_a_folder_without_runs_is_refused(refused):
     assert refused("runs").startswith("no runs found in runs;")
 
 
-def test_an_unknown_task_is_refused(refused):
-    make_run("runs/a", task="walker-wlak")
-    assert refused("runs").startswith("unknown task 'walker-wlak'; did you mean walker-walk")
-    assert "unknown task 'walker-wlak'" in refused("runs", "--benchmark", "dmc-easy")
+def test_tasks_of_no_benchmark_are_reported_alone_or_left_out(run_main, refused, capfd):
+    make_run("runs/a", task="h1-walk")  # of HumanoidBench, and not one of the thirteen
+    assert refused("runs", "--benchmark", "dmc-easy") == "no run on a task of dmc-easy; the runs are on h1-walk."
+    make_run("more/b", task="registered")
+    run_main("runs", "more")
+    assert capfd.readouterr().out.startswith("2 runs on 2 tasks of Tasks without a benchmark")
+    make_run("runs/c")
+    expected = "h1-walk is of no benchmark, other runs are; report them apart, or pass --benchmark."
+    assert refused("runs") == expected
+    run_main("runs", "--benchmark", "dmc-easy")
+    assert capfd.readouterr().out.startswith("1 run on 1 task of Easy DMC")
 
 
 def test_an_unknown_benchmark_is_refused_with_the_names_of_those_there_are(refused):

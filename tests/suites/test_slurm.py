@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -53,6 +54,11 @@ def written(small, tmp_path, **options):
     return runs, write_slurm_script(runs, folder, "mine", **options)
 
 
+def table_of(script) -> Path:
+    (line,) = (line for line in script.read_text().splitlines() if line.startswith("eval "))
+    return Path(shlex.split(line.rpartition('p" ')[2].removesuffix(')"'))[0])
+
+
 def begun(run) -> None:
     deadline = time.monotonic() + 30
     while not (run.path / "eval.csv").exists() and time.monotonic() < deadline:
@@ -75,9 +81,18 @@ def test_bash_reads_it_and_the_options_are_there(small, tmp_path):
         "--gres=gpu:1",
         "--comment=two words",
     ]
-    lines = [shlex.split(line) for line in (script.parent / "slurm.txt").read_text().splitlines()]
+    lines = [shlex.split(line) for line in table_of(script).read_text().splitlines()]
     assert [line[0] for line in lines] == [str(log_file(run)) for run in runs]
     assert all(line[1:5] == [sys.executable, "-m", "torchrl_etdmpc.commands", "train"] for line in lines)
+
+
+def test_a_script_that_waits_keeps_its_table_when_another_part_is_written(small, tmp_path):
+    runs, script = written(small, tmp_path)
+    table = table_of(script)  # SLURM keeps the script as it was submitted
+    before = table.read_text()
+    write_slurm_script(runs[1:], script.parent, "the rest")
+    assert table.read_text() == before
+    assert table_of(script).read_text().splitlines() == before.splitlines()[1:]
 
 
 @pytest.mark.parametrize("sbatch", ["--time='1", "gpu", "--a=1 b", "'--a=1\nrm'"])
@@ -88,7 +103,7 @@ def test_what_is_no_option_is_refused(small, tmp_path, sbatch):
 
 def test_a_path_that_a_line_cannot_hold_is_refused(small, tmp_path):
     runs = small.experiment().runs(tmp_path / "two\nlines")
-    with pytest.raises(ValueError, match="a path or a setting holds a line break, which slurm.txt cannot"):
+    with pytest.raises(ValueError, match="a path or a setting holds a line break, which the table of commands cannot"):
         write_slurm_script(runs, tmp_path, "mine")
 
 

@@ -152,14 +152,11 @@ def choose_budget(
 
 
 def choose_benchmark(arguments: argparse.Namespace, runs: Table) -> Benchmark:
-    """The one asked for, or that of the runs' tasks; Gymnasium's and users' tasks are one of their own."""
-    from torchrl_etdmpc.analysis import benchmark_of, get_benchmark, own_benchmark
+    """The one asked for, or that of the runs' tasks; tasks of no benchmark, e.g. Gymnasium's, are one of their own."""
+    from torchrl_etdmpc.analysis import BENCHMARKS, benchmark_of, get_benchmark, own_benchmark
 
     present = list(dict.fromkeys(runs["task"]))
-    own = [task for task in present if "/" in task or ":" in task]
-    for task in present:
-        if task not in own:
-            benchmark_of([task])  # an unknown task is an error, one of another benchmark is left out
+    own = [task for task in present if not any(task in benchmark.tasks for benchmark in BENCHMARKS.values())]
     if arguments.benchmark:
         return get_benchmark(arguments.benchmark)
     if not own:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,7 +58,10 @@ exit "$code"
 def write_slurm_script(
     runs: Sequence[Run], folder: Path, title: str, *, sbatch: str = "", workers: int | None = None, retries: int = 2
 ) -> Path:
-    """Writes ``slurm.sh`` and ``slurm.txt``, which holds the log and the command of each index, into a folder.
+    """Writes ``slurm.sh`` and a table with the log and the command of each index into a folder.
+
+    The table's name, ``slurm-DIGEST.txt``, follows from what it holds: SLURM keeps the script that was submitted, but
+    an index reads its line when it starts, so a job that waits keeps its table whatever is written after it.
 
     Args:
         runs (sequence of Run): at least one; those that are finished when their turn comes cost seconds.
@@ -101,11 +105,15 @@ def write_slurm_script(
         f"--output={folder / 'slurm-%A_%a.out'}",
         *own,  # the last of two counts
     ]
-    script, commands = folder / "slurm.sh", folder / "slurm.txt"
     threads = " threads=${SLURM_CPUS_PER_TASK:-1}"  # for a run whose settings leave them open
     lines = [shlex.join([str(log_file(run)), *command(run)]) + threads * (run.config.threads is None) for run in runs]
     if any("\n" in line for line in lines):
-        raise ValueError("a path or a setting holds a line break, which slurm.txt cannot; choose another runs_dir.")
+        raise ValueError(
+            "a path or a setting holds a line break, which the table of commands cannot; choose another runs_dir."
+        )
+    table = "\n".join(lines) + "\n"
+    script = folder / "slurm.sh"
+    commands = folder / f"slurm-{hashlib.sha256(table.encode()).hexdigest()[:8]}.txt"
     body = _BODY.format(
         title=title,
         count=len(runs),
@@ -116,6 +124,6 @@ def write_slurm_script(
         retries=retries,
         code=EXIT_CODE,
     )
-    write_whole(commands, "\n".join(lines) + "\n")
+    write_whole(commands, table)
     write_whole(script, "\n".join(["#!/bin/bash", *(f"#SBATCH {shlex.quote(option)}" for option in options), body]))
     return script
