@@ -159,6 +159,15 @@ def test_steps_that_are_not_environment_steps_are_an_error(tmp_path):
         read_run(run)
 
 
+def test_a_run_that_repeats_actions_as_it_was_told_is_read(tmp_path):
+    run = make_run(tmp_path / "run", HEADER + "400,100,5,1.0,3.0,0.5,10\n")
+    with pytest.raises(ValueError, match="mixes units"):
+        read_run(run)
+    with (run / "config.yaml").open("a") as file:
+        file.write("\naction_repeat: 4\n")
+    assert curve_of(read_run(run)) == [(400.0, 3.0)]
+
+
 def test_one_env_step_is_one_decision_where_actions_are_not_repeated(tmp_path):
     run = make_run(tmp_path / "run", HEADER + "1000,1000,5,1.0,3.0,0.5,10\n", task="h1hand-walk")
     assert curve_of(read_run(run)) == [(1000.0, 3.0)]

@@ -116,6 +116,18 @@ def test_the_budget_may_be_the_benchmark_s_and_the_base_is_read(tmp_path):
     assert found.base == "b"
 
 
+def test_a_variant_may_have_a_budget_of_its_own(tmp_path):
+    variants = {"a": {}, "short": {"total_env_steps": 100}}
+    root = plan(tmp_path, budget=200, variants=variants, seeds=[1])
+    found = read_experiment(root)
+    assert (found.env_steps("walker-walk", "a"), found.env_steps("walker-walk", "short")) == (200, 100)
+    for variant in variants:
+        make_run(root, variant, 1)
+    assert incomplete_runs(read(root), [found]) == [
+        "a on walker-walk with seed 1: ends at 100 env steps, its budget is 200"
+    ]
+
+
 def test_a_plan_that_a_suite_wrote_is_read(tmp_path):
     from torchrl_etdmpc.suites import Experiment, write_experiment
 

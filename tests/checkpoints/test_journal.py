@@ -179,6 +179,24 @@ def test_a_buffer_that_was_not_full_fits_into_a_larger_one(tmp_path, written, ca
         ReplayJournal(tmp_path).load(copy, files)
 
 
+@settings(max_examples=30, deadline=None)
+@given(steps=STEPS, more=st.integers(1, 40), written=st.integers(1, 30))
+def test_what_goes_on_in_a_larger_buffer_is_loaded_as_it_was_saved(tmp_path_factory, steps, more, written):
+    folder = tmp_path_factory.mktemp("journal")
+    run = Pipeline(make_buffer(30))
+    run.write(written)
+    files, capacity = ReplayJournal(folder).save(run.buffer, version=run.version), 30 + more
+    journal, run.buffer = ReplayJournal(folder), make_buffer(capacity)
+    journal.load(run.buffer, files)
+    for action, number in [*steps, ("refresh", 30), ("save", 0)]:
+        if action in ("save", "reload"):
+            files, copy = journal.save(run.buffer, version=run.version), make_buffer(capacity)
+            ReplayJournal(folder).load(copy, files)
+            assert_same(run.buffer, copy)
+        else:
+            getattr(run, action)(number)
+
+
 def damage(path, how: str) -> None:
     data = bytearray(path.read_bytes())
     if how == "missing":

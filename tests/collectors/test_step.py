@@ -759,6 +759,21 @@ def test_collection_that_goes_on_after_a_non_finite_step_starts_a_fresh_episode(
         assert [int(row["observation"][1]) for row in steps] == list(range(len(steps)))
 
 
+@pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])
+@pytest.mark.parametrize("capacity", [100, 8])  # 8: a ring that is written over
+def test_a_sampler_that_followed_an_episode_learns_that_a_fault_ended_it(lengths, capacity):
+    replay = make_replay(capacity, sampler=StepSliceSampler(3, partial=True), batch_size=600)
+    env = make_env(lengths, broken="reward", broken_at=14)
+    collector = StepCollector(env, RandomActions(), replay_buffer=replay)
+    with pytest.raises(NonFiniteError):
+        while True:
+            collector.step()
+            if len(replay) > 2 * len(lengths):
+                replay.sample()
+    # All episodes have ended now, so a slice may begin in every row.
+    assert set(replay.sample()["index"].reshape(-1, 3)[:, 0].tolist()) == set(range(len(replay)))
+
+
 def test_no_gradient_is_recorded():
     weight = torch.nn.Parameter(torch.ones(1))
     policy = RandomActions(answer=lambda call, action: action * weight)

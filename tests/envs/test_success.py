@@ -27,6 +27,16 @@ def test_an_episode_of_another_length_has_none():
 
 
 @needs_gymnasium
+def test_an_episode_of_a_task_without_a_limit_of_its_own_has_none(monkeypatch):
+    import gymnasium
+
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+    gymnasium.register(id="Endless-v0", entry_point="gymnasium.envs.classic_control:PendulumEnv")
+    assert success_return(get_task("gym/Endless-v0", episode_length=50)) is None
+
+
+@needs_gymnasium
 def test_a_task_that_somebody_else_makes_has_none(monkeypatch):
     monkeypatch.setattr("torchrl_etdmpc.envs.tasks._tasks", {})
     monkeypatch.setattr("torchrl_etdmpc.envs.tasks._makers", {})

@@ -62,6 +62,15 @@ def test_a_random_state_is_that_of_the_seed(checkpoint, run_main, tmp_path):
     assert one.manifest["state"]["seed"] == 5
 
 
+def test_a_random_state_lies_within_an_episode_that_ended_early(run_main, tmp_path, save_untrained):
+    checkpoint = save_untrained(tmp_path / "hopper", 4, task="gym/InvertedPendulum-v5", model={"termination": True})
+    for seed in range(3):  # the pole falls within some 20 of 1000 steps
+        message, _, err = run_main(f"checkpoint={checkpoint}", f"seed={seed}", f"save=page{seed}", "play=bare")
+        assert message is None, err
+    steps = [load_trace(tmp_path / f"page{seed}" / "trace.npz").manifest["state"]["step"] for seed in range(3)]
+    assert max(steps) < 100
+
+
 def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, save_untrained):
     checkpoint = save_untrained(tmp_path / "checkpoints", 3, task=PENDULUM)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))

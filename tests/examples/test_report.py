@@ -327,7 +327,7 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
         (("--budget", "-1"), "--budget must be positive, got -1."),
         (("--watch", "0"), "--watch must be positive, got 0."),
         (("--grid-step", "300000"), "the grid needs at least two steps"),
-        (("--budget", "250000"), "the budget must be a multiple of the grid step"),
+        (("--budget", "250000", "--grid-step", "100000"), "the budget must be a multiple of the grid step"),
     ],
 )
 def test_an_option_that_makes_no_sense_is_refused(refused, arguments, message):
@@ -427,6 +427,13 @@ def test_runs_on_a_task_of_no_benchmark_say_where_they_are_compared(run_main, ca
     make_run("runs/b", task="gym/Pendulum-v1", seed=2, text=HEADER + "".join(rows[:2]))
     run_main("runs")
     assert "up to 10,000 env steps, compared at 2,000, which all of them reach; 1 missing" in capfd.readouterr().out
+
+
+def test_a_budget_that_the_usual_step_does_not_divide_has_another_one(run_main):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 250_001, 50_000))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs", "--budget", "250000")
+    assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 2_500
 
 
 def test_a_small_budget_needs_no_step_of_the_grid(run_main, capfd):

@@ -49,3 +49,15 @@ def test_no_gradient_reaches_the_rows_and_what_was_passed_is_not_changed():
     assert not any(moment.requires_grad for moment in moved)
     assert torch.equal(mean, torch.zeros(2))
     assert torch.equal(variance, torch.ones(2))
+
+
+def test_rows_that_do_not_count_are_as_if_they_were_not_there():
+    generator = torch.Generator().manual_seed(0)
+    rows, counts = torch.randn(9, 4, 2, generator=generator), torch.rand(9, 4, generator=generator) > 0.4
+    mean, variance = torch.tensor([3.0, 1.0]), torch.tensor([5.0, 2.0])
+    expected = updated_moments(mean, variance, rows[counts], 0.25)
+    torch.testing.assert_close(updated_moments(mean, variance, rows, 0.25, counts), expected)
+    rows[~counts] = torch.nan
+    torch.testing.assert_close(updated_moments(mean, variance, rows, 0.25, counts), expected)
+    moved = updated_moments(mean, variance, rows, 0.25, torch.zeros_like(counts))
+    assert torch.equal(moved[0], mean) and torch.equal(moved[1], variance)

@@ -91,6 +91,17 @@ def test_many_actions_in_one_latent_give_what_each_candidate_gives_alone(states,
 # Dropout
 
 
+@pytest.mark.parametrize("states", [1, 3, 4])  # 4: as many as heads
+@pytest.mark.parametrize("own", ["the same for all states", "of each state", "of each head"])
+def test_many_actions_in_one_latent_are_those_of_a_copy_of_the_latent_for_each(states, own, randomised):
+    model = randomised(num_dynamics=4)
+    latent = simnorm(torch.randn(1, states, 1, L))
+    shape = {"the same for all states": (7, A), "of each state": (states, 7, A), "of each head": (4, states, 7, A)}[own]
+    action = torch.rand(shape)
+    copies = latent.expand(-1, -1, 7, -1)
+    torch.testing.assert_close(model.next(latent, action), model.next(copies, action))
+
+
 @pytest.mark.parametrize("training", [True, False])
 def test_value_dropout_acts_only_when_asked_for_and_never_through_the_training_mode(training, randomised):
     model = randomised(dropout=0.5).train(training)

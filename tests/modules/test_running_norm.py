@@ -84,5 +84,5 @@ def test_an_encoder_of_ones_own_standardises_by_itself():
         WorldModel(None, A, encoder=nn.Linear(O, 512), normalize_observations=True)
     assert str(error.value) == (
         "normalize_observations is for the encoder that is built here; put a RunningNorm into your own, and a method "
-        "observe(observation) that moves it."
+        "observe(observation, counts) that moves it."
     )

@@ -115,3 +115,10 @@ def test_a_plan_without_a_scale_in_one_dimension_is_no_plan(make_loss, world_mod
     expected = run_seeded(loss, slices)
     slices["plan", "scale"][0, 0] = torch.tensor([0.0, -1.0, 0.5])
     torch.testing.assert_close(run_seeded(loss, slices)["loss_policy"], expected["loss_policy"])
+
+
+@pytest.mark.parametrize("kind", ["whole", "model", "value", "policy"])
+def test_a_loss_is_where_its_world_model_is(kind, make_world_model, make_loss):
+    loss = make_loss(kind, make_world_model().to("meta"), updater=False)
+    assert {buffer.device.type for buffer in loss.buffers()} <= {"meta"}
+    assert {parameter.device.type for parameter in loss.parameters()} == {"meta"}

@@ -11,7 +11,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.functional import simnorm
 from torchrl_etdmpc.modules import ActionValueWorldModel, RunningNorm, WorldModel
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss, TDMPC2Loss
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss, TDMPC2Loss, Term
 from torchrl_etdmpc.testing import random_slices
 
 
@@ -100,8 +100,8 @@ class OwnEncoder(nn.Module):
         self.norm = RunningNorm(3)
         self.linear = nn.Linear(3, 16)
 
-    def observe(self, observation: torch.Tensor) -> None:
-        self.norm.observe(observation)
+    def observe(self, observation: torch.Tensor, counts: torch.Tensor | None) -> None:
+        self.norm.observe(observation, counts)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return simnorm(self.linear(self.norm(observation)), 8)
@@ -113,8 +113,8 @@ def test_an_encoder_that_only_standardises_has_nothing_to_learn_and_moves_its_st
             super().__init__()
             self.norm = RunningNorm(16)
 
-        def observe(self, observation: torch.Tensor) -> None:
-            self.norm.observe(observation)
+        def observe(self, observation: torch.Tensor, counts: torch.Tensor | None) -> None:
+            self.norm.observe(observation, counts)
 
         def forward(self, observation: torch.Tensor) -> torch.Tensor:
             return simnorm(self.norm(observation), 8)
@@ -138,3 +138,47 @@ def test_an_encoder_of_ones_own_that_begins_with_buffers_is_trained_and_shown_wh
     optimizer.step()
     assert model.encoder.norm.batches == 1
     assert not torch.equal(model.encoder.linear.weight, before)
+
+
+def test_slices_that_are_all_padding_are_not_counted_in(make_normalising_loss, make_slices):
+    loss, batch = make_normalising_loss(), make_slices()
+    norm, valid = loss.world_model.encoder.norm, torch.ones(batch.shape[:2], dtype=torch.bool)
+    valid[2:] = False
+    batch["collector", "mask"] = valid
+    loss(batch)
+    seen = batch["observation"][:2, 0]
+    torch.testing.assert_close(norm.mean, seen.mean(0))
+    torch.testing.assert_close(norm.variance, seen.var(0, correction=0))
+    before = copy.deepcopy(norm.state_dict())
+    batch["collector", "mask"] = torch.zeros_like(valid)
+    loss(batch)
+    assert all(torch.equal(before[name], value) for name, value in norm.state_dict().items())
+
+
+def test_after_a_cast_the_loss_saves_and_loads_the_statistics_that_its_model_uses(make_normalising_loss, make_slices):
+    loss, other = make_normalising_loss().double(), make_normalising_loss().double()
+    loss(make_slices().double())
+    mean = loss.world_model.encoder.norm.mean
+    assert mean.dtype == torch.float64 and mean.abs().min() > 0
+    assert torch.equal(loss.state_dict()["encoder_params.norm.mean"], mean)
+    other.load_state_dict(loss.state_dict())
+    assert torch.equal(other.world_model.encoder.norm.mean, mean)
+
+
+def test_a_target_encoder_standardises_as_the_encoder_does(make_world_model, make_slices):
+    def own(world_model, slices, rollout):
+        return rollout.predicted[1:].square().mean((1, -1))
+
+    term = Term("own", own, networks=("encoder",), targets=("encoder",))
+    model = make_world_model(normalize_observations=True)
+    loss = EfficientTDMPCLoss(model, discount=0.9, extra_terms=[term], ignore_termination=True)
+    update = SoftUpdate(loss, tau=0.5)
+    batch = make_slices()
+    batch["observation"] = batch["observation"] + 50
+    for _ in range(3):
+        loss(batch)
+        update.step()
+    targets = loss.targets()["encoder"]
+    for name, statistic in model.encoder.norm.named_buffers():
+        assert torch.equal(targets[f"norm.{name}"], statistic), name
+    assert targets["norm.mean"].min() > 40

@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch._dynamo.testing import CompileCounter
 from torchrl.collectors import Collector
+from torchrl.envs import ExplorationType
+from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc import Plan
 from torchrl_etdmpc.planners import PlanNoise
@@ -35,6 +37,15 @@ def test_the_weights_are_shared_with_the_world_model(make_planner, make_model, s
         for weight in model.value_head.parameters():
             weight.add_(torch.randn_like(weight))
     assert not torch.allclose(planner.plan(observation, noise=noise).value, before)
+
+
+@pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+def test_noise_that_is_added_to_an_action_in_place_does_not_move_the_target(make_planner, states, kind):
+    with set_exploration_type(kind):
+        out = make_planner()(TensorDict({"observation": states(3)}, [3]))
+    target = out["plan", "loc"].clone()
+    out["action"].add_(1.0)
+    assert torch.equal(out["plan", "loc"], target)
 
 
 def test_a_copy_plans_with_weights_of_its_own(make_planner, states, assert_same_plan):

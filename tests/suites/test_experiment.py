@@ -332,3 +332,34 @@ def test_a_search_may_have_more_trials_but_no_other_space_tasks_seeds_or_budget(
     ):
         with pytest.raises(ValueError, match="was begun in .* for the search 'a', whose trials would not compare"):
             extended(stored, read_experiment(write(**changes, base=None)), tmp_path)
+
+
+def test_env_steps_among_the_settings_are_the_budget(write, tmp_path):
+    experiment = read_experiment(write(budget=None, settings={"preset": "cpu", "total_env_steps": 30_000}))
+    assert experiment.budget == 30_000
+    assert "total_env_steps" not in experiment.settings
+    write_experiment(experiment, tmp_path / "stored.yaml")
+    assert read_experiment(tmp_path / "stored.yaml").budget == 30_000
+    assert read_experiment(tmp_path / "mine.yaml", settings={"total_env_steps": 60_000}).budget == 60_000
+
+
+def test_env_steps_of_the_command_replace_those_of_a_variant(write):
+    variants = {"one": {}, "short": {"total_env_steps": 20_000}}
+    file = write(variants=variants, base="one")
+    experiment = read_experiment(file)
+    steps = {name: experiment.config(name, "cup-catch", 1).total_env_steps for name in variants}
+    assert steps == {"one": 50_000, "short": 20_000}
+    longer = read_experiment(file, settings={"total_env_steps": 60_000})
+    assert {longer.config(name, "cup-catch", 1).total_env_steps for name in variants} == {60_000}
+    assert longer.variants["one"] == {}
+
+
+def test_no_seeds_of_the_command_are_not_those_of_the_file(write):
+    with pytest.raises(ValueError, match="seeds of .* must be a list of numbers or how many, got 0"):
+        read_experiment(write(), seeds=0)
+
+
+def test_a_name_that_stands_twice_is_refused(write):
+    text = "tasks: [walker-walk]\nseeds: 1\nbudget: 100\nvariants:\n  a: {optim.lr: 1e-3}\n  a: {optim.lr: 3e-3}\n"
+    with pytest.raises(ValueError, match=r"mine.yaml is not an experiment: 'a' stands twice, at line 5 and after it\."):
+        read_experiment(write(text))

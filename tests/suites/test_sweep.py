@@ -70,6 +70,14 @@ def test_ranges_of_whole_numbers_propose_whole_numbers(search, tmp_path):
     assert set(horizons) <= {2, 3, 4, 5}
 
 
+def test_a_range_of_a_setting_that_is_whole_holds_whole_numbers_however_its_ends_are_written(search, tmp_path):
+    space = {"optim.batch_size": {"low": 64, "high": 1e3}, "optim.grad_clip_norm": {"low": 1.0, "high": 20.0}}
+    sweep = Sweep(search(space=space), "tuned", tmp_path)
+    settings = [sweep.propose()[0].config.optim for _ in range(4)]
+    assert {type(one.batch_size) for one in settings} == {int}
+    assert any(not one.grad_clip_norm.is_integer() for one in settings)
+
+
 def test_the_value_of_a_trial_is_the_mean_over_tasks_and_seeds_of_the_last_return(search, small, tmp_path):
     sweep = Sweep(search(trials=2, seeds=(1, 2, 6)), "tuned", tmp_path)
     train(small, sweep)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.util
 import os
@@ -138,6 +139,36 @@ def test_a_finished_run_goes_on_with_a_larger_budget(command, resume):
     action, config = plan(asked, "total_env_steps")
     assert (action, config.total_env_steps) == ("resume", 161)
     assert plan(asked)[0] == "nothing"  # the command did not name it
+
+
+@pytest.mark.parametrize("budget", [70, 80])
+def test_a_budget_that_is_spent_already_is_refused(command, budget):
+    save(begin(command()))
+    asked = command(resume="on", total_env_steps=budget)
+    with pytest.raises(ValueError, match=rf"^total_env_steps={budget} is not above the 80 env steps that the run in "):
+        plan(asked, "total_env_steps")
+    assert plan(command(resume="on", total_env_steps=81), "total_env_steps")[0] == "resume"
+
+
+def test_a_run_whose_last_step_was_saved_before_its_end_goes_on(command):
+    config = command()
+    save(begin(config), config.total_env_steps)
+    assert plan(command(resume="on", total_env_steps=config.total_env_steps), "total_env_steps")[0] == "resume"
+
+
+@pytest.mark.parametrize("run_dir", ["moved", None])
+def test_a_directory_that_was_moved_goes_on_where_it_is(command, monkeypatch, tmp_path, run_dir):
+    monkeypatch.chdir(tmp_path)
+    there = begin(command())
+    save(there)
+    asked = dataclasses.replace(command(resume="auto"), run_dir=run_dir)
+    place = Path(run_dir or Path("runs", asked.task, asked.preset, f"seed{asked.seed}"))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    there.path.rename(place)
+    settings = with_stored_settings(asked.to_dict(), ["resume"])
+    found = plan_launch(TrainConfig.from_dict(settings), ["resume"])
+    assert (found.action, found.directory.path) == ("resume", place)
+    assert found.config.run_dir == run_dir
 
 
 @pytest.mark.parametrize("resume", ["on", "auto"])

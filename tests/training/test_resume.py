@@ -191,6 +191,8 @@ def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path, small_config, mak
     assert resumed.run()["env_steps"] == 140
     assert read_run_config(RunDirectory(tmp_path)).total_env_steps == 140
     assert len(resumed.learner.replay) == 70
+    again = make_run(longer, tmp_path, resume=True)
+    assert (again.learner.replay[:] == resumed.learner.replay[:]).all()  # targets too
 
 
 def test_other_settings_must_stay(tmp_path, small_config):

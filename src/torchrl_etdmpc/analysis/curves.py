@@ -88,7 +88,8 @@ class Run:
     def read(cls, run_dir: str | os.PathLike[str], *, method: str | None = None) -> Run:
         """Reads the files of a run; see :func:`read_run`."""
         directory, header, table = RunDirectory(run_dir), read_header(run_dir), read_evaluations(run_dir)
-        _check_units(table.assign(task=header["task"]), directory.eval)
+        repeat = header.pop("action_repeat")
+        _check_units(table.assign(task=header["task"]), directory.eval, repeat)
         names = {"method": method or header["preset"], "task": header["task"], "seed": header["seed"]}
         columns = {name: table[name].astype(float) for name in ("env_steps", "return_mean")}
         return cls(directory.path, **names, finished=directory.finished, curve=pd.DataFrame({**names, **columns}))
@@ -129,7 +130,7 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
 
 
 def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
-    """Task, preset and seed of a run.
+    """Task, preset and seed of a run, and its action repeat where it is not the task's own (otherwise ``None``).
 
     Raises:
         FileNotFoundError: if it has neither ``config.yaml`` nor ``summary.json``.
@@ -152,7 +153,8 @@ def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
     kinds = {"task": str, "preset": str, "seed": int}
     if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
         raise ValueError(f"{files[0]} does not give the run's task, preset and seed.")
-    return header
+    repeat = values.get("action_repeat")
+    return header | {"action_repeat": repeat if type(repeat) is int else None}
 
 
 def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
@@ -358,16 +360,17 @@ def _numbers(table: pd.DataFrame, columns: list[str], file: Path) -> None:
         raise ValueError(f"{file}: every row needs env_steps of at least 0.")
 
 
-def _check_units(table: pd.DataFrame, file: Path) -> None:
-    """Refuses steps that are not environment steps."""
+def _check_units(table: pd.DataFrame, file: Path, action_repeat: int | None = None) -> None:
+    """Refuses steps that are not environment steps; ``action_repeat`` takes the place of the tasks' own."""
     if "decision_steps" not in table:
         return
     _numbers(table, ["decision_steps"], file)
-    repeat = np.array([_ACTION_REPEAT.get(task, np.nan) for task in table["task"]])
+    repeats = _ACTION_REPEAT if action_repeat is None else dict.fromkeys(table["task"], action_repeat)
+    repeat = np.array([repeats.get(task, np.nan) for task in table["task"]])
     wrong = ~np.isnan(repeat) & (table["env_steps"].to_numpy() != table["decision_steps"].to_numpy() * repeat)
     if wrong.any():
         row = table[wrong].iloc[0]
         raise ValueError(
             f"{file} mixes units: {row['env_steps']:.0f} env_steps beside {row['decision_steps']:.0f} decision_steps, "
-            f"but {row['task']} has {_ACTION_REPEAT[row['task']]} env steps per decision; write environment steps."
+            f"but {row['task']} has {repeats[row['task']]} env steps per decision; write environment steps."
         )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
@@ -26,6 +26,7 @@ class Experiment:
         seeds (tuple of int): seeds.
         budget (int, optional): env steps of every run. Default: those of the benchmark that a task belongs to.
         base (str, optional): the variant that the others are compared with.
+        own_budgets (mapping): env steps of the variants that have a number of their own.
 
     >>> Experiment(root=Path("runs/utd"), variants=("one", "two"), tasks=("walker-walk",), seeds=(1, 2)).variants
     ('one', 'two')
@@ -37,11 +38,13 @@ class Experiment:
     seeds: tuple[int, ...]
     budget: int | None = None
     base: str | None = None
+    own_budgets: Mapping[str, int] = field(default_factory=dict)
 
-    def env_steps(self, task: str) -> int | None:
-        """How long a run on the task is to be, if that is known."""
-        if self.budget is not None:
-            return self.budget
+    def env_steps(self, task: str, variant: str | None = None) -> int | None:
+        """How long a run on the task, of the variant, is to be, if that is known."""
+        budget = self.budget if variant is None else self.own_budgets.get(variant, self.budget)
+        if budget is not None:
+            return budget
         return next((benchmark.budget for benchmark in BENCHMARKS.values() if task in benchmark.tasks), None)
 
 
@@ -66,9 +69,12 @@ def read_experiment(root: Path) -> Experiment:
         values = yaml.load(file.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         tasks = values["tasks"]
         tasks = BENCHMARKS[tasks].tasks if isinstance(tasks, str) and tasks in BENCHMARKS else tasks
-        variants = values["variants"]
+        variants, own = values["variants"], {}
         if isinstance(variants, dict):  # a search has no runs of its own; its trials are variants
-            variants = [name for name, settings in variants.items() if "search" not in (settings or {})]
+            settings_of = {name: settings or {} for name, settings in variants.items()}
+            variants = [name for name, settings in settings_of.items() if "search" not in settings]
+            own = {name: settings_of[name].get("total_env_steps") for name in variants}
+            own = {name: int(steps) for name, steps in own.items() if steps is not None}
         lists = {"variants": (list(variants), str), "tasks": (tasks, str), "seeds": (values["seeds"], int)}
         for name, (items, kind) in lists.items():
             if not isinstance(items, list | tuple) or not items or not all(isinstance(item, kind) for item in items):
@@ -81,7 +87,7 @@ def read_experiment(root: Path) -> Experiment:
             f"{file} does not list variants, tasks, seeds and a budget, so that nobody can say which runs are missing."
         ) from error
     variants, tasks, seeds = (tuple(items) for items, _ in lists.values())
-    return Experiment(root, variants, tasks, seeds, budget, values.get("base"))
+    return Experiment(root, variants, tasks, seeds, budget, values.get("base"), own)
 
 
 def experiment_root(run: Path) -> Path | None:
@@ -131,7 +137,8 @@ def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[
     for run in runs:
         longest[run.task] = max(longest.get(run.task, 0.0), run.last)  # a NaN is never the larger one
     for run in runs:
-        budget = next((plan.env_steps(run.task) for plan in experiments if plan.root in run.path.parents), None)
+        plan = next((plan for plan in experiments if plan.root in run.path.parents), None)
+        budget = plan.env_steps(run.task, run.method) if plan else None
         target = budget or longest[run.task]
         where = f"{run.method} on {run.task} with seed {run.seed}"
         ends = f"ends at {run.last:,.0f} env steps" if run.last >= 0 else "has no evaluation"

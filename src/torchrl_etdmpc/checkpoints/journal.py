@@ -106,7 +106,9 @@ class ReplayJournal:
         changed = stored.get(self._version_key).reshape(len(stored)) >= old["version"]
         changed[torch.arange(begin, written, device=changed.device) % capacity] = True
         size = -(-capacity // PARTS)
-        entries = {part: [entry for entry in old["targets"] if entry["part"] == part] for part in range(PARTS)}
+        # In a larger buffer than before, where parts have other bounds, all of them are written anew.
+        known = old["targets"] if old.get("capacity") == capacity else []
+        entries = {part: [entry for entry in known if entry["part"] == part] for part in range(PARTS)}
         indices, shares = {}, {}
         for part in range(PARTS):
             low, high = part * size, min((part + 1) * size, len(stored))

@@ -240,7 +240,13 @@ class CheckpointStore:
 
     def exists(self) -> bool:
         """Whether there is something to go on from. Changes nothing: another process may be training here."""
-        return any((self.folder / "resume").glob("[0-9]*")) or any((self.folder / "resume").glob(".*.old"))
+        return self.newest_step() is not None
+
+    def newest_step(self) -> int | None:
+        """Step of the newest checkpoint, whole or not; ``None`` if there is none. Changes nothing, either."""
+        names = [path.name for pattern in ("[0-9]*", ".*.old") for path in (self.folder / "resume").glob(pattern)]
+        steps = [name.removeprefix(".").removesuffix(".old") for name in names]
+        return max((int(step) for step in steps if step.isdecimal()), default=None)
 
     def _folders(self) -> list[Path]:
         for old in (self.folder / "resume").glob(".*.old"):  # moved aside for one of the same step

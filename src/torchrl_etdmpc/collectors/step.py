@@ -253,6 +253,9 @@ class StepCollector(BaseCollector):
             last = self.replay_buffer.storage.get(self._last_rows).clone()
             _truncate(last)
             self.replay_buffer.storage.set(self._last_rows, last, set_cursor=False)
+            end_episodes = getattr(self.replay_buffer.sampler, "end_episodes", None)
+            if end_episodes is not None:  # it may have followed the rows already
+                end_episodes(self._last_rows, self.replay_buffer.storage)
         self._abandon_episodes()
 
     def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:

@@ -111,7 +111,10 @@ def _need_no_renderer(task: Task) -> None:
 
 def _state(config: InspectConfig, inspection: Inspection) -> State:
     if config.state == "random":
-        length = config.steps or (inspection.task.decision_steps_per_episode if inspection.task else 1)
+        length = 1
+        if inspection.task is not None:
+            most = inspection.task.decision_steps_per_episode
+            length = inspection.play(config.seed) if inspection.task.terminates else min(config.steps or most, most)
         step = torch.randint(length, (), generator=torch.Generator().manual_seed(config.seed))
         return State(episode=config.seed, step=int(step))
     where, step = config.state.split(":")

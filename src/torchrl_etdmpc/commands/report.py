@@ -132,12 +132,19 @@ def choose_budget(
 
     last = runs.groupby(["method", "task", "seed"])["env_steps"].max()
     reached = int(last.min())
-    planned = {plan.env_steps(task) for plan in experiments for task in plan.tasks if task in set(runs["task"])}
+    present = set(runs["task"])
+    planned = {
+        plan.env_steps(task, variant)
+        for plan in experiments
+        for task in plan.tasks
+        for variant in plan.variants
+        if task in present
+    }
     planned = {budget for budget in planned if budget and budget <= last.max()}
     step = None
     if arguments.budget or (reached >= benchmark.budget and benchmark.name in BENCHMARKS):
         budget = arguments.budget or benchmark.budget
-        step = DEFAULT_GRID_STEP if budget >= 2 * DEFAULT_GRID_STEP else None
+        step = DEFAULT_GRID_STEP if budget >= 2 * DEFAULT_GRID_STEP and budget % DEFAULT_GRID_STEP == 0 else None
     elif len(planned) == 1:  # a run that ended early is named, and does not shorten the others
         (budget,) = planned
     else:

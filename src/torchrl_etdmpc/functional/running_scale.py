@@ -27,7 +27,7 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | Non
     batch = batch.detach().flatten()
     if batch.dtype != torch.float64:  # torch.quantile takes no half precision
         batch = batch.float()
-    levels = torch.tensor([0.05, 0.95], dtype=batch.dtype, device=batch.device)
+    levels = torch.linspace(0.05, 0.95, 2, dtype=batch.dtype, device=batch.device)  # made there, not sent there
     if counts is None:
         quantiles = torch.quantile(batch, levels)
     else:

@@ -165,6 +165,10 @@ class Inspection:
         known = self._episodes.get(episode)
         return None if known is None else known[1]
 
+    def play(self, episode: int) -> int:
+        """Plays an episode, or remembers it, and returns how many decisions it has."""
+        return len(self._worker.submit(self._episode, Job(), episode).result().action)
+
     def length(self, episode: int) -> int | None:
         """Decisions of an episode that was played."""
         known = self._episodes.get(episode)

@@ -68,7 +68,8 @@ class DynamicsEnsemble(LayerStack):
         else:
             of_latent, of_action = first.weight.split([latent.shape[-1], action.shape[-1]], dim=-2)
             bias = first.bias.view(-1, *(1,) * len(shape), first.bias.shape[-1])
-            x = first.finish(_product(latent, of_latent) + (_product(action.unsqueeze(0), of_action) + bias))
+            action = action[(None,) * (latent.ndim - action.ndim)]
+            x = first.finish(_product(latent, of_latent) + (_product(action, of_action) + bias))
         for layer in self.hidden[1:]:
             x = layer(x)
         return self.output(x)

@@ -58,13 +58,17 @@ class Encoder(LayerStack):
         if self.norm is not None:
             self.norm.reset_parameters()
 
-    def observe(self, observation: Tensor) -> None:
+    def observe(self, observation: Tensor, counts: Tensor | None = None) -> None:
         """Moves the statistics that observations ``[..., O]`` are standardised by, if they are.
 
         The losses call it in training mode with every batch, before they encode it.
+
+        Args:
+            observation (Tensor): ``[..., O]``.
+            counts (Tensor, optional): which of them count, bool, ``[...]``. Default: all.
         """
         if self.norm is not None:
-            self.norm.observe(observation)
+            self.norm.observe(observation, counts)
 
     def forward(self, observation: Tensor) -> Tensor:
         """``[..., O] -> [..., L]``."""

@@ -44,11 +44,17 @@ class RunningNorm(nn.Module):
         """How many batches the statistics are of."""
 
     @torch.no_grad()
-    def observe(self, rows: Tensor) -> None:
-        """Counts a batch ``[..., O]`` in, with the same weight as each one before."""
-        self.batches.add_(1)
+    def observe(self, rows: Tensor, counts: Tensor | None = None) -> None:
+        """Counts a batch ``[..., O]`` in, with the same weight as each one before.
+
+        Args:
+            rows (Tensor): ``[..., O]``.
+            counts (Tensor, optional): which rows count, bool, ``[...]``; a batch in which none does is none. Default:
+                all of them.
+        """
+        self.batches.add_(1 if counts is None else counts.any())
         rate = 1 / self.batches.to(self.mean.dtype)
-        mean, variance = updated_moments(self.mean, self.variance, rows, rate)
+        mean, variance = updated_moments(self.mean, self.variance, rows, rate, counts)
         self.mean.copy_(mean)
         self.variance.copy_(variance)
 

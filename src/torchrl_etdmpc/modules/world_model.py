@@ -136,7 +136,7 @@ class WorldModel(nn.Module):
             if normalize_observations:
                 raise ValueError(
                     "normalize_observations is for the encoder that is built here; put a RunningNorm into your own, "
-                    "and a method observe(observation) that moves it."
+                    "and a method observe(observation, counts) that moves it."
                 )
             _refuse_training_mode(encoder)
         self.encoder = encoder

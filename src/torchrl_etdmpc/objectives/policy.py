@@ -118,7 +118,7 @@ def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_directi
         raise ValueError(f"kl_direction must be one of {', '.join(get_args(KLDirection))}, got {kl_direction!r}.")
     loss.scale_tau = scale_tau
     loss.kl_direction = kl_direction
-    loss.register_buffer("kl_scale", torch.ones(()))
+    loss.register_buffer("kl_scale", torch.ones((), device=loss.rho.device))
 
 
 def policy_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float) -> Term:

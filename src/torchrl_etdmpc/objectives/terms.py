@@ -279,17 +279,18 @@ class LatentRolloutLoss(LossModule):
         for name, attribute in self._attributes.items():
             if name in trained and getattr(world_model, attribute) is not None:
                 self.convert_to_functional(getattr(world_model, attribute), name, create_target_params=name in followed)
+        device = world_model.version.device
         self._scalars: frozenset[str] = frozenset()
         for term in self.terms:
             numbers = {f"{term.name}_coef": term.coef, **term.scalars}
             for name, number in numbers.items():
                 if not math.isfinite(number):
                     raise ValueError(f"{name} must be finite, got {number}.")
-                self.register_coeff_buffer(name, float(number))
+                self.register_coeff_buffer(name, float(number), device=device)
             self._scalars |= numbers.keys()
             if isinstance(term.function, nn.Module):
                 self.add_module(term.name, term.function)
-        self.register_buffer("rho", torch.tensor(float(rho)))
+        self.register_buffer("rho", torch.tensor(float(rho), device=device))
         self.ignore_termination = ignore_termination
         self.distill = True
         count_updates(world_model, self.parameters())
@@ -305,6 +306,7 @@ class LatentRolloutLoss(LossModule):
         # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
         super()._apply(fn, *args, **kwargs)
         self.__dict__["world_model"]._apply(fn)
+        self._read_networks()  # a cast keeps parameters and replaces buffers
         return self
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
@@ -313,14 +315,20 @@ class LatentRolloutLoss(LossModule):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._trained = {}
-        # The entries of <name>_params are the very parameters of the world model's networks, and planner, loss and
-        # updater rely on it. A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__,
-        # where convert_to_functional put them), but tensordict clones its entries: the loss would train weights that
-        # nobody reads. So they are read anew from the networks. The targets are nobody else's and stay as copied.
+        # A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__, where
+        # convert_to_functional put them), but tensordict clones its entries: the loss would train weights that nobody
+        # reads. The targets are nobody else's and stay as copied.
+        self._read_networks()
+        count_updates(self.world_model, self.parameters())
+
+    def _read_networks(self) -> None:
+        """Makes the entries of <name>_params the very parameters and buffers of the world model's networks again.
+
+        Planner, loss and updater rely on it.
+        """
         for name in self._attributes:
             if f"{name}_params" in self._modules:
                 self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
-        count_updates(self.world_model, self.parameters())
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
@@ -596,14 +604,21 @@ class LatentRolloutLoss(LossModule):
         return [p for name, own in self.network_parameters().items() if name in idle for p in own] if idle else []
 
     def targets(self) -> dict[str, dict[str, Tensor]]:
-        """The parameters of the target networks, by network and name."""
+        """What the target networks are made of, by network and name: their parameters, and the network's own buffers.
+
+        ``SoftUpdate`` moves parameters alone, and a target whose statistics stay where they began is another network.
+        """
         found: dict[str, dict[str, Tensor]] = {}
         parameters: dict[str, Any] = self._modules
         for name, target in parameters.items():
             if name.startswith("target_"):
-                keys = ((key,) if isinstance(key, str) else key for key in target.keys(True, True))
                 network = name.removeprefix("target_").removesuffix("_params")
-                found[network] = {".".join(key): target.get(key).data for key in keys}
+                entries = found[network] = {}
+                for key in target.keys(True, True):
+                    own = parameters[f"{network}_params"].get(key)
+                    trained = isinstance(own, nn.Parameter)
+                    entry = target.get(key).data if trained else own.detach().clone()  # it moves before it is read
+                    entries[key if isinstance(key, str) else ".".join(key)] = entry
         return found
 
     def evaluate(
@@ -623,7 +638,8 @@ class LatentRolloutLoss(LossModule):
         if self.training and "encoder_params" in self._modules:  # who trains an encoder moves its statistics, too
             observe = getattr(self.world_model.encoder, "observe", None)
             if observe is not None:
-                observe(slices.observation)  # the first of each slice: what lies beyond an end is not among them
+                counts = None if slices.counts is None else slices.counts[0]
+                observe(slices.observation, counts)  # the first of each slice
         rollout = latent_rollout(self.world_model, slices)._replace(targets=targets)
         losses, metrics = {}, {}
         for term in self.active_terms:

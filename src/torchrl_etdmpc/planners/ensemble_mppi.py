@@ -483,7 +483,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         start = latent.new_zeros(shape) if plan_mean is None else shift_plan(plan_mean.reshape(shape))
         search = self._search(latent, self._initial(latent, start), noise, trace)
         loc, scale, value = self._target(latent, search, noise.elite, explore)
-        action = clipped_sample(loc, scale, noise.action) if explore else loc
+        # A copy: who adds noise to the action in place does not move the target that is distilled.
+        action = clipped_sample(loc, scale, noise.action) if explore else loc.clone()
         outputs = (action, loc, scale, value, search.gaussian.mean, search.fallback)
         outputs = [field.reshape(batch + field.shape[1:]) for field in outputs]
         if not trace:

@@ -126,6 +126,18 @@ class StepSliceSampler(Sampler):
         self._written += len(index)
         self._newest = index[-1]
 
+    def end_episodes(self, rows: int | Tensor, storage: TensorStorage) -> None:
+        """Is called after the last rows of running episodes were made their ends, as after a fault.
+
+        Args:
+            rows (int or Tensor): of the storage.
+            storage (TensorStorage): what this sampler samples from.
+        """
+        if self._newest is not None:
+            before = (int(self._newest) - torch.as_tensor(rows).reshape(-1).cpu().numpy()) % storage.max_size
+            self._trajectories.end(self._written - 1 - before)
+            self._starts = None
+
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draws the rows of ``batch_size / slice_len`` slices, slice after slice.
 

@@ -65,6 +65,17 @@ class Trajectories:
                 self._table[_ENDED, position] = 1
                 del self._open[identity]
 
+    def end(self, numbers: np.ndarray) -> None:
+        """Ends the running trajectories whose last rows are among these.
+
+        Args:
+            numbers (ndarray): write numbers, ``[n]``.
+        """
+        for identity, position in list(self._open.items()):
+            if self._table[_LAST, position] in numbers:
+                self._table[_ENDED, position] = 1
+                del self._open[identity]
+
     def _new(self) -> int:
         if self._size == self._table.shape[1]:
             self._table = np.concatenate([self._table, np.zeros_like(self._table)], axis=1)

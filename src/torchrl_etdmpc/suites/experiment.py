@@ -28,7 +28,14 @@ _THE_SUITES_OWN = ("task", "seed", "run_dir", "resume")
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML in which ``1e-3`` is a number: PyYAML takes it for text."""
+    """YAML in which ``1e-3`` is a number, which PyYAML takes for text, and no name stands twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [self.construct_object(key, deep=True) for key, _ in node.value]
+        doubled = next((name for place, name in enumerate(names) if name in names[:place]), None)
+        if doubled is not None:
+            raise ValueError(f"{doubled!r} stands twice, at line {node.start_mark.line + 1} and after it.")
+        return super().construct_mapping(node, deep=deep)
 
 
 _Loader.add_implicit_resolver(
@@ -71,7 +78,8 @@ class Search:
 
     Args:
         space (mapping): by the name of a setting the values to choose from, ``[64, 128]``, or their range,
-            ``{"low": 1e-4, "high": 3e-3, "log": True}``; a range between whole numbers holds whole numbers.
+            ``{"low": 1e-4, "high": 3e-3, "log": True}``; a range between whole numbers, or of a setting that is one,
+            holds whole numbers.
         trials (int): how many are made.
         settings (mapping): those that all trials share.
         prune (bool): whether a trial ends early whose return is below the median of those before it, at the same step.
@@ -99,6 +107,12 @@ class Search:
                 _is_range(values) if isinstance(values, Mapping) else isinstance(values, list) and bool(values),
                 f"search of {name} must be a list of values or low and high, with log: true or not, got {values!r}.",
             )
+
+    def is_whole(self, name: str) -> bool:
+        """Whether a range holds whole numbers: that of a setting that is one, or between two of them."""
+        low, high = self.space[name]["low"], self.space[name]["high"]
+        counted = type(flat(preset("cpu").to_dict()).get(name.removeprefix("task."))) is int
+        return type(low) is type(high) is int or (counted and float(low).is_integer() and float(high).is_integer())
 
     def points(self) -> list[dict[str, Any]]:
         """Every value of a list and both ends of a range, one at a time: if these can be trained, all can."""
@@ -278,21 +292,22 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
     _require(not unknown, f"{file} has an unknown entry {', '.join(unknown[:1])}; known: {', '.join(sorted(known))}.")
     shared = _settings(values.get("settings"), f"settings of {file}")
     _require(
-        "budget" not in values or "total_env_steps" not in shared,
+        values.get("budget", "benchmark") == "benchmark" or "total_env_steps" not in shared,
         f"{file} says budget and, in its settings, total_env_steps, which are the same; leave one out.",
     )
     more = dict(changes.get("settings") or {})
-    budget: Any = more.pop("total_env_steps", values.get("budget", "benchmark"))
+    budget: Any = more.get("total_env_steps", shared.pop("total_env_steps", values.get("budget", "benchmark")))
     budget = int(budget) if isinstance(budget, float) and budget.is_integer() else budget
     _require(
         budget == "benchmark" or (type(budget) is int and budget > 0),
         f"budget of {file} must be a number of env steps or 'benchmark', got {budget!r}.",
     )
     variants, searches = _variants(values.get("variants"), more, file)
+    more.pop("total_env_steps", None)
     return Experiment(
         name=file.stem,
-        tasks=_tasks(changes.get("tasks") or values.get("tasks"), file),
-        seeds=_seeds(changes.get("seeds") or values.get("seeds"), file),
+        tasks=_tasks(values.get("tasks") if changes.get("tasks") is None else changes["tasks"], file),
+        seeds=_seeds(values.get("seeds") if changes.get("seeds") is None else changes["seeds"], file),
         variants=variants,
         searches=searches,
         settings=shared | more,
@@ -391,12 +406,12 @@ def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str
     for name, settings in (given or {}).items():
         what = f"variant {name} of {file}"
         if not (isinstance(settings, dict) and "search" in settings):
-            variants[str(name)] = {**_settings(settings, what), **more}
+            variants[str(name)] = _replaced(_settings(settings, what), more)
             continue
         _require(isinstance(settings["search"], dict), f"{what} must search settings by name.")
         fixed = dict(settings)
         space, trials, prune = fixed.pop("search"), fixed.pop("trials", None), fixed.pop("prune", True)
-        shared = {**_settings(fixed, what), **more}
+        shared = _replaced(_settings(fixed, what), more)
         both = sorted(set(map(str, space)) & set(shared))
         _require(not both, f"{what} searches {', '.join(both)}, which is given as well.")
         try:
@@ -404,6 +419,11 @@ def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str
         except ValueError as error:
             raise ValueError(f"{what}: {error}") from error
     return variants, searches
+
+
+def _replaced(own: dict[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """A variant's settings under those of a command, whose env steps are the budget unless the variant has its own."""
+    return own | {name: value for name, value in more.items() if name != "total_env_steps" or name in own}
 
 
 def _is_range(values: Mapping[str, Any]) -> bool:

@@ -191,8 +191,8 @@ def _distributions(search: Search) -> dict[str, optuna.distributions.BaseDistrib
     for name, values in search.space.items():
         if isinstance(values, list):
             found[name] = CategoricalDistribution(values)
-        elif isinstance(values["low"], int) and isinstance(values["high"], int):
-            found[name] = IntDistribution(values["low"], values["high"], log=values.get("log", False))
+        elif search.is_whole(name):
+            found[name] = IntDistribution(int(values["low"]), int(values["high"]), log=values.get("log", False))
         else:
             found[name] = FloatDistribution(values["low"], values["high"], log=values.get("log", False))
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import multiprocessing
 import warnings
 from collections.abc import Iterable, Mapping
@@ -88,13 +89,20 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
         directory.require_new()
         return Launch(config, directory, "begin")
     stored = read_run_config(directory, type(config))
-    merged = resumed_config(stored, config, explicit)
+    # A directory that was moved or copied is where it is now.
+    merged = dataclasses.replace(resumed_config(stored, config, explicit), run_dir=config.run_dir)
     if directory.finished and merged.total_env_steps <= stored.total_env_steps:
         return Launch(merged, directory, "nothing")
-    if not CheckpointStore(directory.checkpoints).exists():  # starting over would remove results
+    made = CheckpointStore(directory.checkpoints).newest_step()
+    if made is None:  # starting over would remove results
         raise FileNotFoundError(
             f"run_dir={directory} holds results but no checkpoint to go on from; choose another run_dir, or remove "
             "this one to train again."
+        )
+    if merged.total_env_steps < stored.total_env_steps and merged.total_env_steps <= made:
+        raise ValueError(
+            f"total_env_steps={merged.total_env_steps} is not above the {made} env steps that the run in {directory} "
+            "has made; name more, or leave it out to go on."
         )
     return Launch(merged, directory, "resume")
 
@@ -251,7 +259,8 @@ def with_stored_settings(
     resume = "off" if resume in (False, "false") else str(resume)
     if not _says_its_settings(directory, resume) or resume == "off" or directory.leftover:
         return dict(values)
-    return resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
+    stored = resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
+    return {**stored, "run_dir": values.get("run_dir")}
 
 
 def _says_its_settings(directory: RunDirectory, resume: str) -> bool:
