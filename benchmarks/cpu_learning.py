@@ -128,7 +128,7 @@ def beside_baselines(returns: pd.DataFrame) -> list[str]:
     return [
         f"| mean return at | {' | '.join(groups)} |",
         "|---" * (1 + len(groups)) + "|",
-        *sorted(lines, key=lines.get),
+        *sorted(lines, key=lambda row: lines[row]),
     ]
 
 
