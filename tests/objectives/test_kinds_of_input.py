@@ -3,6 +3,12 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import LazyStackedTensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss, TDMPC2Loss
+from torchrl_etdmpc.testing import random_slices
 
 
 def test_a_memory_mapped_batch_gives_the_same_numbers(loss, slices, run_seeded, assert_same_output, tmp_path):
@@ -122,3 +128,29 @@ def test_a_loss_is_where_its_world_model_is(kind, make_world_model, make_loss):
     loss = make_loss(kind, make_world_model().to("meta"), updater=False)
     assert {buffer.device.type for buffer in loss.buffers()} <= {"meta"}
     assert {parameter.device.type for parameter in loss.parameters()} == {"meta"}
+
+
+@pytest.mark.parametrize(
+    ("model", "kind"), [(WorldModel, EfficientTDMPCLoss), (ActionValueWorldModel, TDMPC2Loss)], ids=["bmpc", "tdmpc2"]
+)
+def test_a_loss_computes_on_one_device_alone(model, kind, monkeypatch):
+    """On the meta device, which every machine has: a CPU tensor among those of another device fails there, or waits."""
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda device: False)  # which does not know that device
+    mixed = []
+
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            out = function(*args, **(kwargs or {}))
+            tensors = [leaf for leaf in tree_leaves((args, kwargs, out)) if isinstance(leaf, torch.Tensor)]
+            if len({tensor.device for tensor in tensors}) > 1:
+                mixed.append(function)
+            return out
+
+    loss = kind(model(3, 2, latent_dim=16, mlp_dim=32, normalize_observations=True).to("meta"), discount=0.99)
+    batch = random_slices(3, 2)
+    batch["collector", "mask"] = torch.ones(batch.shape, dtype=torch.bool)
+    batch = batch.to("meta")
+    with Watch():
+        out = loss.evaluate(loss.slices(batch), loss.targets())
+    assert mixed == []
+    assert {value.device.type for value in out.values()} == {"meta"}
