@@ -225,8 +225,8 @@ def test_the_means_of_the_readme_are_those_of_the_table():
     tuned, others = ({name: returns["50,000", kind] for name, returns in table.items()} for kind in ("tuned", "others"))
     figure = tuned["TD-MPC2 (EZ-V2's figure)"]
     for text in (
-        f"Mean return of these at 50,000 env steps: this {early['cpu']}, EfficientZero V2 {early['EfficientZero V2']} "
-        f"(read off a figure), DR.Q {early['DR.Q']}, DC-MPC {early['DC-MPC']}; FoG {early['FoG']} if it counts",
+        f"Mean return at 50,000 env steps: this {early['cpu']}, DR.Q {early['DR.Q']}, DC-MPC {early['DC-MPC']}; FoG "
+        f"{early['FoG']} if it counts",
         f": this {late['cpu']}, SimbaV2 at UTD 8 {late['SimbaV2-UTD8']}, DR.Q {late['DR.Q']}, BMPC {late['BMPC']}, "
         f"TD-MPC2 {late['TD-MPC2']}.",
         f"on them it has {tuned['cpu']} at 50,000, TD-MPC2 {figure} (read off",
