@@ -363,3 +363,9 @@ def test_a_name_that_stands_twice_is_refused(write):
     text = "tasks: [walker-walk]\nseeds: 1\nbudget: 100\nvariants:\n  a: {optim.lr: 1e-3}\n  a: {optim.lr: 3e-3}\n"
     with pytest.raises(ValueError, match=r"mine.yaml is not an experiment: 'a' stands twice, at line 5 and after it\."):
         read_experiment(write(text))
+
+
+def test_settings_may_be_shared_by_yaml_s_own_means(write):
+    text = "tasks: [walker-walk]\nseeds: 1\nbudget: 100\nvariants:\n  a: &shared {optim.lr: 1e-3, loss.rho: 0.4}\n"
+    experiment = read_experiment(write(text + "  b: {<<: *shared, loss.rho: 0.6}\n"))
+    assert experiment.variants["b"] == {"optim.lr": 1e-3, "loss.rho": 0.6}

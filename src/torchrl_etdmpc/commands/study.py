@@ -27,8 +27,7 @@ from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
 from torchrl_etdmpc.inspector.studies import choose_states
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.runs import library_versions, progress_bar, replacing
-from torchrl_etdmpc.runs.errors import first_line
+from torchrl_etdmpc.runs import first_line, library_versions, progress_bar, replacing
 from torchrl_etdmpc.runs.files import write_whole
 from torchrl_etdmpc.training import load_agent, resolve_device
 

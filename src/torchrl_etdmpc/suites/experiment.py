@@ -31,7 +31,8 @@ class _Loader(yaml.SafeLoader):
     """YAML in which ``1e-3`` is a number, which PyYAML takes for text, and no name stands twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [self.construct_object(key, deep=True) for key, _ in node.value]
+        keys = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]  # <<: *shared
+        names = [self.construct_object(key, deep=True) for key in keys]
         doubled = next((name for place, name in enumerate(names) if name in names[:place]), None)
         if doubled is not None:
             raise ValueError(f"{doubled!r} stands twice, at line {node.start_mark.line + 1} and after it.")
