@@ -40,7 +40,7 @@ help:
 train: export TORCHRL_ETDMPC_MAKE := 1
 train: $(READY)
 	@echo "$(TASK) learns on this CPU, in some minutes; Ctrl-C stops and saves"
-	@$(VENV)/bin/python examples/train_dmc.py task=$(TASK) preset=cpu threads=$(THREADS) seed=1 total_env_steps=25000 eval_every=5000 run_dir="$(RUN_DIR)" $(ARGS)
+	@$(VENV)/bin/python examples/train_dmc.py task=$(TASK) preset=cpu threads=$(THREADS) seed=1 total_env_steps=20000 eval_every=5000 run_dir="$(RUN_DIR)" $(ARGS)
 	@echo 'the curve:        $(RUN_DIR)/curve.png'
 	@echo 'a film of it:     make watch$(SAME_RUN)'
 	@echo 'a report:         make report$(SAME_RUN)'

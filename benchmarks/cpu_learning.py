@@ -26,6 +26,7 @@ from pathlib import Path
 import pandas as pd
 
 from torchrl_etdmpc.analysis import get_benchmark, read_runs
+from torchrl_etdmpc.analysis.statistics import Z_95
 from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import RunDirectory
 
@@ -117,7 +118,7 @@ def beside_baselines(returns: pd.DataFrame) -> list[str]:
             if len(own) < group["task"].nunique():
                 cells.append("–")
                 continue
-            mean, half = own["mean"].mean(), 1.96 * own["standard_error"].pow(2).sum(skipna=False) ** 0.5 / len(own)
+            mean, half = own["mean"].mean(), Z_95 * own["standard_error"].pow(2).sum(skipna=False) ** 0.5 / len(own)
             cell = f"{'≈ ' if own['kind'].eq('interpolated').any() else ''}{mean:.0f}"
             cells.append(cell if pd.isna(half) else f"{cell} [{mean - half:.0f}, {mean + half:.0f}]")
             place = -mean  # ends as that over all tasks at the last step

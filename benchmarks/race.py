@@ -34,6 +34,7 @@ from matplotlib.figure import Figure
 from tensordict.nn import TensorDictModule
 
 from torchrl_etdmpc.analysis import estimate, method_styles, read_runs
+from torchrl_etdmpc.analysis.statistics import Z_95
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import get_task, make_env
 from torchrl_etdmpc.envs.dmc import domain_and_task
@@ -160,7 +161,7 @@ def report(ours: list[Path]) -> str:
                 line = found[(found["task"] == task) & (found["method"] == method) & (found["env_steps"] > 0)]
                 axis.plot(line[x], line["mean"], label=method, linewidth=1.6, **styles[method])
                 if line["se"].notna().all():
-                    spread = 1.96 * line["se"]
+                    spread = Z_95 * line["se"]
                     axis.fill_between(
                         line[x], line["mean"] - spread, line["mean"] + spread, color=styles[method]["color"], alpha=0.15
                     )

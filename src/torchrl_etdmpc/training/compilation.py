@@ -19,9 +19,9 @@ _OPTIONS: dict[str, Any] = {
     "cpp_wrapper": True,  # a hundred small operations are called from C++ and not from Python
     "cpp_wrapper_build_separate": True,  # the kernels without PyTorch's headers: a third of g++'s time
 }
-_WORTH_IT = 10_000
-"""Decisions with updates from which compiling with an empty cache pays on a CPU: two minutes, for 10 ms per decision
-with the preset ``cpu``, and more with larger networks."""
+_WORTH_IT = 6_000
+"""Decisions with updates from which compiling with an empty cache pays on a CPU: two minutes of one core, for 20 ms per
+decision with the preset ``cpu``, and more with larger networks."""
 
 
 def resolve_compile(setting: str, device: torch.device, decisions: int) -> str | None:

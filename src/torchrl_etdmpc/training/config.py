@@ -219,7 +219,7 @@ class TrainConfig:
     """auto, cpu, cuda or cuda:N."""
     compile: Literal["auto", "off", "default", "max"] = "auto"
     """``auto`` compiles planner and gradients where it can, which takes two minutes the first time; on a CPU, in runs
-    of at least 10,000 decisions after the random phase, for which that pays."""
+    of at least 6,000 decisions after the random phase, for which that pays."""
     logger: LoggerName = "none"
     """Where the numbers go besides the run's own files."""
     eval_every: int = 50_000

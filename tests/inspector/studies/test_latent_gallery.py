@@ -45,3 +45,12 @@ def test_pessimism_keeps_the_heads_together(make_episodes, make_planner, WorldSi
     assert len(axes) == 2 * latent_gallery.SHOWN
     assert [len(axis.lines) for axis in axes[: latent_gallery.SHOWN]] == [2 * (2 + 1 + 1) + 1] * latent_gallery.SHOWN
     assert "beta 10 over beta 0, geometric mean: 0." in latent_gallery.lines(result)[0]
+
+
+def test_one_head_has_no_spread_to_speak_of(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=1, policy_gain=1.0)
+    states = choose_states(make_episodes(world, world.optimal_action), 5, ahead=4)
+    result = latent_gallery.latent_gallery(make_planner(world), states, WorldSimulator(world), horizon=4)
+    (text,) = latent_gallery.lines(result)
+    assert text.startswith("true return of the whole plan, beta 10 minus beta 0: ")
+    assert len(latent_gallery.figure(result).axes) == 2 * latent_gallery.SHOWN

@@ -122,6 +122,8 @@ def lines(result: LatentGallery) -> list[str]:
     first, last = result.betas[0], result.betas[-1]
     texts = []
     for name, values in (("spread of the heads", result.spread), ("deviation of the returns", result.deviation)):
+        if not values.any():  # of one head, or of one estimate
+            continue
         ratio = episode_interval((values[:, -1, -1] / values[:, 0, -1]).log(), result.episode)
         low, middle, high = (bound.exp().item() for bound in (ratio.low, ratio.value, ratio.high))
         texts.append(
@@ -159,7 +161,8 @@ def figure(result: LatentGallery) -> Any:
             top.plot(*places[number, :heads].mean(0).unbind(-1), color=colour, marker="o", markersize=3)
             top.plot(*places[number, heads].unbind(-1), color=colour, linestyle="--", marker="x", markersize=5)
             estimates = result.returns[state, number].flatten(-2)
-            bottom.errorbar(depths, estimates.mean(-1), estimates.std(-1), color=colour, marker="o", capsize=3)
+            spread = estimates.std(-1) if estimates.shape[-1] > 1 else None
+            bottom.errorbar(depths, estimates.mean(-1), spread, color=colour, marker="o", capsize=3)
             bottom.plot(depths, result.true_returns[state, number], color=colour, linestyle="--", marker="x")
         top.plot(*places[0, 0, 0], color="black", marker="s", markersize=5)
         top.set_title(f"{float(shares.sum()):.0%} of the variance", fontsize=8)
