@@ -252,3 +252,18 @@ def test_an_encoder_with_nothing_to_learn_trains_the_rest():
     sum(terms[key] for key in terms.keys() if key.startswith("loss_")).backward()
     assert model.policy.output.weight.grad.isfinite().all()
     assert model.policy.output.weight.grad.any()
+
+
+def test_what_an_encoder_has_frozen_stays_frozen_in_training_mode():
+    torch.manual_seed(0)
+    layers = nn.Sequential(nn.Linear(3, 16), nn.BatchNorm1d(16), nn.Dropout(0.5), nn.Linear(16, 16)).eval()
+    world_model = WorldModel(None, 1, encoder=layers, latent_dim=16, mlp_dim=16)
+    planner = EnsembleMPPIPlanner(LatentEnv(world_model), horizon=2, num_samples=8, num_elites=4, num_proposals=2)
+    observation, mean = torch.randn(6, 3), layers[1].running_mean.clone()
+    alone = world_model.encode(observation[:1])
+    for module in (world_model, planner):
+        module.eval()
+        assert module.train().training
+        assert world_model.policy.training
+        torch.testing.assert_close(world_model.encode(observation)[:1], alone)
+        assert torch.equal(layers[1].running_mean, mean)

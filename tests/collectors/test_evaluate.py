@@ -185,3 +185,15 @@ def test_the_bare_policy_acts_with_the_mean_whatever_the_exploration():
         assert torch.equal(out["action"], mean)
         assert not out["action"].requires_grad
         assert set(out.keys()) == {"observation", "action"}
+
+
+def test_an_environment_of_other_bounds_is_refused_before_it_is_stepped():
+    env = CountingEnv(3)
+    env.action_spec = Bounded(-2, 2, (1,))
+    model = WorldModel(1, 1, latent_dim=16, mlp_dim=16)
+    planner = EnsembleMPPIPlanner(
+        LatentEnv(model), horizon=2, num_samples=8, num_elites=4, warm_start=False, num_proposals=0
+    )
+    with pytest.raises(ValueError, match=r"bounds of -2 and 2 instead of -1 and 1 \(append ActionScaling\(\)\)"):
+        evaluate(env, planner, episodes=1)
+    assert env.resets == 0

@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import LazyStackedTensorDict
+from tensordict import LazyStackedTensorDict, TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss, TDMPC2Loss
@@ -154,3 +155,29 @@ def test_a_loss_computes_on_one_device_alone(model, kind, monkeypatch):
         out = loss.evaluate(loss.slices(batch), loss.targets())
     assert mixed == []
     assert {value.device.type for value in out.values()} == {"meta"}
+
+
+@pytest.mark.parametrize(
+    "key", [("next", "reward"), ("plan", "loc"), ("plan", "scale"), ("next", "observation"), "observation"]
+)
+@pytest.mark.parametrize("index", [slice(1), (slice(None), slice(1))], ids=["one slice", "one step"])
+def test_an_entry_of_other_slices_is_not_spread_over_the_batch(key, index):
+    loss = EfficientTDMPCLoss(WorldModel(5, 3, latent_dim=16, mlp_dim=16, encoder_dim=16), discount=0.9)
+    SoftUpdate(loss, tau=0.01)
+    batch = random_slices(5, 3, num_slices=4, slice_len=3)
+    short = TensorDict({name: value for name, value in batch.items(True, True)}, [])
+    short[key] = short[key][index]
+    with pytest.raises(ValueError, match=r"entries of shape \[B, T, features\], got .* of shape \[(1, 3|4, 1), "):
+        loss(short)
+
+
+def test_half_precision_leaves_the_discount_as_it_is():
+    loss = EfficientTDMPCLoss(WorldModel(5, 3, latent_dim=16, mlp_dim=16), discount=0.995, rho=0.3)
+    loss.to(torch.bfloat16)
+    SoftUpdate(loss, tau=0.01)
+    assert next(loss.parameters()).dtype == torch.bfloat16
+    assert (loss.discount.item(), loss.rho.item()) == pytest.approx((0.995, 0.3), rel=1e-7)
+    batch = random_slices(5, 3, num_slices=4, slice_len=3)
+    assert torch.isfinite(loss(batch.apply(lambda x: x.bfloat16() if x.is_floating_point() else x))["loss_value"])
+    loss.double()
+    assert loss.discount.dtype == torch.float64

@@ -154,5 +154,5 @@ def learn_from_prioritised_slices(loss) -> None:
         batch = buffer.sample().reshape(-1, 3)
         assert batch["priority_weight"].shape == (8, 3)
         loss(batch)
-        buffer.update_tensordict_priority(batch.reshape(-1))
+        buffer.update_tensordict_priority(batch[:, 0])
     assert sys.modules["torchrl._torchrl"]

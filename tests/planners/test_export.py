@@ -138,3 +138,14 @@ def test_an_example_that_is_no_tensor_is_refused(export):
         TypeError, match="observation must be a tensor, got dict; a model that encodes dictionaries cannot"
     ):
         export(make_model(), observation={"pixels": torch.zeros(3)})
+
+
+def test_a_planner_without_a_warm_start_leaves_the_carried_plan_aside():
+    planner = make_planner(make_model(), warm_start=False)
+    observation, carried = torch.randn(1, 5), torch.full((1, 3, 2), 0.9)
+    program = export_planner(planner).module()
+    found = []
+    for plan in (carried, torch.zeros(1, 3, 2)):
+        torch.manual_seed(1)
+        found.append(program(observation, plan)[0])
+    assert torch.equal(*found)

@@ -146,3 +146,43 @@ def test_values_and_ends_are_those_that_are_given():
 def test_what_is_no_model_of_torchrl_is_refused():
     with pytest.raises(TypeError, match=r"^model must be a ModelBasedEnvBase or a TensorDict module, got Linear; wrap"):
         make(nn.Linear(2, 2))
+
+
+BUDGET = {"horizon": 2, "num_samples": 16, "num_elites": 4, "num_proposals": 0, "warm_start": False}
+
+
+def placed(encoder: TensorDictModule, **keys) -> EnsembleMPPIPlanner:
+    move = TensorDictModule(lambda place, action: place + action / 2, in_keys=["place", "action"], out_keys=["place"])
+    world = WorldModelWrapper(move, TensorDictModule(rewarded, in_keys=["place"], out_keys=["reward"]))
+    model = TorchRLModel(world, action_dim=1, state_sizes={"place": 1}, encoder=encoder, **keys)
+    return EnsembleMPPIPlanner(LatentEnv(model), **BUDGET, **keys)
+
+
+def test_an_encoder_of_images_says_itself_what_the_batch_is():
+    encoder = TensorDictModule(lambda image: image.float().mean((-3, -2, -1))[..., None], ["pixels"], ["place"])
+    planner = placed(encoder, observation_key="pixels")
+    images = torch.full((5, 3, 8, 8), 2, dtype=torch.uint8)
+    assert (planner.world_model.encode(images) == 2).all()
+    assert planner(TensorDict({"pixels": images}, [5]))["action"].shape == (5, 1)
+
+
+def test_an_encoder_of_two_entries_reads_them_from_a_nested_observation():
+    encoder = TensorDictModule(lambda one, other: one + other, in_keys=["one", "other"], out_keys=["place"])
+    planner = placed(encoder, observation_key="seen")
+    seen = TensorDict({"one": torch.ones(5, 1), "other": torch.ones(5, 1)}, [5])
+    assert (planner.world_model.encode(seen) == 2).all()
+    assert planner(TensorDict({"seen": seen}, [5]))["action"].shape == (5, 1)
+    with pytest.raises(
+        ValueError, match=r"the encoder reads \['one', 'other'\], so an observation must be a TensorDict"
+    ):
+        planner.world_model.encode(torch.ones(5, 2))
+
+
+def test_the_next_state_may_stand_below_next_and_the_reward_at_the_root():
+    state = ("next", "place")
+    move = TensorDictModule(lambda place, action: place + action / 2, in_keys=["place", "action"], out_keys=[state])
+    world = WorldModelWrapper(move, TensorDictModule(rewarded, in_keys=[state], out_keys=["reward"]))
+    model = TorchRLModel(world, action_dim=1, state_sizes={"place": 1})
+    place, action = torch.zeros(1, 1), torch.ones(1, 1)
+    assert model.next(place, action).item() == 0.5
+    assert model.reward(place, action).item() == -((0.5 - GOAL) ** 2)

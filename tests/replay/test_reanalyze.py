@@ -14,7 +14,7 @@ from torchrl.data import (
     TensorDictReplayBuffer,
     TensorDictRoundRobinWriter,
 )
-from torchrl.envs import ExplorationType
+from torchrl.envs import DoubleToFloat, ExplorationType, ObservationNorm
 from torchrl.envs.utils import exploration_type, set_exploration_type
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, ReanalyzeTransform, StepSliceSampler, WorldModel
@@ -554,3 +554,36 @@ def test_a_storage_of_more_dimensions_is_refused():
     )
     with pytest.raises(ValueError, match=r"one-dimensional storage, got ndim=2; use LazyTensorStorage\(capacity\)"):
         make_reanalyze(buffer)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"plan_key": "target"}, r"the planner writes .*'action', .*, but reanalyze needs \('plan', 'loc'\)"),
+        ({"observation_key": "seen"}, r"the planner reads 'seen', but reanalyze needs 'observation'; give it the pla"),
+    ],
+)
+def test_a_planner_of_other_keys_is_refused_before_anything_is_sampled(options, text):
+    with pytest.raises(ValueError, match=text):
+        make_reanalyze(make_buffer(20), make_planner(**options))
+
+
+def test_a_planner_that_leaves_out_its_targets_is_refused():
+    with pytest.raises(ValueError, match="the planner writes 'action', but reanalyze needs"):
+        make_reanalyze(make_buffer(20), make_planner().select_out_keys("action"))
+
+
+def test_a_transform_that_would_change_what_was_planned_from_comes_first():
+    scaled = {"loc": 0.0, "scale": 100.0, "in_keys": ["observation"], "standard_normal": False}
+    buffer = make_buffer(20)
+    buffer.append_transform(ObservationNorm(**scaled))
+    make_reanalyze(buffer)
+    buffer.append_transform(DoubleToFloat(in_keys=["action"]))
+    buffer.sample()
+    late = make_buffer(20)
+    make_reanalyze(late)
+    late.append_transform(ObservationNorm(**scaled))
+    before = content(late)
+    with pytest.raises(RuntimeError, match="ObservationNorm changes 'observation' after reanalyze has planned from it"):
+        late.sample()
+    assert (content(late) == before).all()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import itertools
 from collections import defaultdict
 
@@ -803,3 +804,39 @@ def test_a_sample_can_have_the_shape_that_the_losses_take(partial):
     assert set(flat.keys(True, True)) == set(shaped.keys(True, True)) >= {"index", "index_generation"}
     assert (flat.reshape(4, 3) == shaped).all()
     assert "as_slices=True" in repr(sampler)
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.float32, torch.float16])
+@pytest.mark.parametrize("first", [2**11, 2**24, 2**53])
+def test_ids_beside_a_floating_flag_keep_their_last_digit(dtype, first):
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(40), sampler=StepSliceSampler(3), batch_size=300)
+    ids = first + torch.arange(40) % 2  # two environments, row by row
+    flags = torch.zeros(40, 1, dtype=dtype)
+    buffer.extend(TensorDict({"collector": {"traj_ids": ids}, "next": {"done": flags}, "is_init": flags}, [40]))
+    slices = buffer.sample()["collector", "traj_ids"].reshape(-1, 3)
+    assert (slices == slices[:, :1]).all()
+
+
+@pytest.mark.parametrize("how", ["dumps", "state_dict"])
+def test_a_full_buffer_is_rolled_back_in_the_process_that_filled_it(how, tmp_path):
+    def write(buffer, begin, number):
+        ids = torch.zeros(number, dtype=torch.int64)
+        buffer.extend(TensorDict({"t": torch.arange(begin, begin + number), "collector": {"traj_ids": ids}}, [number]))
+
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=StepSliceSampler(3), batch_size=300)
+    for step in range(33):
+        write(buffer, step, 1)
+    buffer.dumps(tmp_path)
+    kept = copy.deepcopy(buffer.state_dict())
+    write(buffer, 33, 5)
+    buffer.sample()
+    _ = buffer.loads(tmp_path) if how == "dumps" else buffer.load_state_dict(kept)
+    for newest in (32, 34):
+        slices = buffer.sample()["t"].reshape(-1, 3)
+        assert (slices.diff() == 1).all()
+        assert (slices.min().item(), slices.max().item()) == (newest - 19, newest)
+        write(buffer, 33, 2)
+    buffer.writer._cursor += 1  # somebody else
+    with pytest.raises(RuntimeError, match="others have written to the full storage"):
+        buffer.storage.set(0, buffer.storage[0])
+        buffer.sample()

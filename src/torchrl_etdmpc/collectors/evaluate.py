@@ -50,7 +50,8 @@ def evaluate(
         Episodes: the return and the length of each, shape ``[episodes]``.
 
     Raises:
-        ValueError: if ``episodes`` is not positive.
+        ValueError: if ``episodes`` is not positive, or the environment does not fit the planner's model, e.g. because
+            its actions have other bounds.
 
     >>> from torchrl.envs import GymEnv, RewardSum, TransformedEnv
     >>> from torchrl.envs.utils import RandomPolicy
@@ -60,6 +61,10 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
+    make_primer = getattr(policy, "make_tensordict_primer", None)
+    check = None if make_primer is None else getattr(make_primer(), "check", None)
+    if check is not None:
+        check(env)
     num_envs = max(env.batch_size.numel(), 1)
     if policy_device is not None and torch.device(policy_device) == env.device:
         policy_device = None

@@ -75,7 +75,8 @@ class Encoder(LayerStack):
         dtype = self.output.weight.dtype
         if observation.dtype != dtype and not torch.is_autocast_enabled(observation.device.type):
             raise TypeError(
-                f"observations are {observation.dtype} and the weights {dtype}; append torchrl.envs.DoubleToFloat() to "
-                "the environment, or cast one of the two with .to(dtype)."
+                f"observations are {observation.dtype} and the weights {dtype}; append torchrl.envs."
+                f"DTypeCastTransform({observation.dtype}, {dtype}) to the environment, or cast one of the two with "
+                ".to(dtype)."
             )
         return self.through(observation if self.norm is None else self.norm(observation))

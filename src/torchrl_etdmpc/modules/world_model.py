@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -174,6 +175,13 @@ class WorldModel(nn.Module):
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
         """How many gradient updates made these weights; stamped on every planner target."""
 
+    def train(self, mode: bool = True) -> WorldModel:
+        """Sets the mode of all networks; what an encoder of yours has frozen (dropout, batch statistics) stays so."""
+        super().train(mode)
+        for _, layer in _unlike_in_training(self.encoder):
+            layer.eval()
+        return self
+
     def reset_parameters_recursive(self) -> None:
         """Draws new weights in every network (the hook that TorchRL's losses call)."""
         for network in self.children():
@@ -224,13 +232,20 @@ class WorldModel(nn.Module):
         return clipped_sample(mean, log_std.exp(), noise)
 
 
-def _refuse_training_mode(encoder: nn.Module) -> None:
-    """Raises where an encoder acts differently in training: planning and evaluations use the same one, in that mode."""
+def _unlike_in_training(encoder: nn.Module) -> Iterator[tuple[str, nn.Module]]:
+    """Layers that act differently in training, with their names."""
     for name, layer in encoder.named_modules():
         random = isinstance(layer, nn.RReLU) or (isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0)
         random |= isinstance(layer, nn.MultiheadAttention | nn.RNNBase) and layer.dropout > 0
         moving = isinstance(layer, nn.modules.batchnorm._NormBase) and layer.track_running_stats
-        if layer.training and (random or moving):
+        if random or moving:
+            yield name, layer
+
+
+def _refuse_training_mode(encoder: nn.Module) -> None:
+    """Raises where an encoder acts differently in training: planning and evaluations use the same one, in that mode."""
+    for name, layer in _unlike_in_training(encoder):
+        if layer.training:
             raise ValueError(
                 f"the encoder's {type(layer).__name__} {name!r} acts differently in training, and planning would use "
                 "it so; leave it, or its dropout, out (LayerNorm and GroupNorm are fine), or freeze it by .eval()."

@@ -149,7 +149,8 @@ class LatentRolloutLoss(LossModule):
 
     Where a prioritised sampler has written ``priority_weight``, the mean is weighted by it, slice by slice, and the new
     priorities of the slices, the mean absolute errors of their values against the targets, are written into the batch
-    at ``td_error``, for ``buffer.update_tensordict_priority(batch)``: the only entry that a loss writes to its input.
+    at ``td_error``, for ``buffer.update_tensordict_priority(batch[:, 0])``, which leaves the rows alone that no drawn
+    slice begins with: the only entry that a loss writes to its input.
     ``loss.use_prioritized_weights = False`` leaves the weights aside, not the priorities. A loss without values has no
     priority to offer.
 
@@ -304,7 +305,12 @@ class LatentRolloutLoss(LossModule):
 
     def _apply(self, fn, *args, **kwargs):
         # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
+        scalars = {name: self.get_buffer(name) for name in (*self._scalars, "rho")}
         super()._apply(fn, *args, **kwargs)
+        for name, exact in scalars.items():
+            now = self.get_buffer(name)
+            if now.element_size() < exact.element_size():  # a discount of 0.99 is 0.988 in bfloat16
+                self.register_buffer(name, exact.to(now.device))
         self.__dict__["world_model"]._apply(fn)
         self._read_networks()  # a cast keeps parameters and replaces buffers
         return self
@@ -426,7 +432,7 @@ class LatentRolloutLoss(LossModule):
         Raises:
             ValueError: if an entry is not of shape [B, T, features] (one that the encoder owns: [B, T, ...]), or
                 a row of a CPU tensor terminates although the world model has no termination head. Elsewhere that
-                check would wait for the device and is skipped.
+                check would wait for the device, and under ``torch.compile`` it cannot be made: it is skipped.
             KeyError: if a key is missing.
             RuntimeError: if the world model's weights are no longer those that this loss trains, or its targets are
                 elsewhere.
@@ -434,9 +440,9 @@ class LatentRolloutLoss(LossModule):
         self._refuse_other_weights()
         reads = self._reads()
         entries: dict[NestedKey, Any] = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
-        for name in _OBSERVATIONS:
-            if entries[name].shape[:2] != entries["action"].shape[:2]:
-                raise self._shape_error(reads[name], entries[name])
+        for name, entry in entries.items():
+            if entry.shape[:2] != entries["action"].shape[:2]:  # it would be spread over the batch, or fail elsewhere
+                raise self._shape_error(reads[name], entry)
         counts = self._counted_steps(tensordict, entries["action"].shape[:2])
         self._refuse_termination(tensordict, counts)
         for name, entry in entries.items():

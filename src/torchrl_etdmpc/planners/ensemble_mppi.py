@@ -588,6 +588,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             returns = self._imagination(latent, actions, **options)
         else:
             inputs = latent.to(self.scoring_dtype), actions.to(self.scoring_dtype)
+            options["dtype"] = latent.dtype
             returns = functional_call(self._imagination, weights_cast, inputs, options)
         scores = self.score(returns)
         if scores.shape != actions.shape[:2]:

@@ -29,7 +29,8 @@ class _Planner(nn.Module):
         self.planner = planner
 
     def forward(self, observation: Tensor, plan_mean: Tensor) -> tuple[Tensor, Tensor]:
-        plan = self.planner.plan(observation, plan_mean, explore=False)  # never the compiled one
+        carried = plan_mean if self.planner.warm_start else None
+        plan = self.planner.plan(observation, carried, explore=False)  # never the compiled one
         return plan.action, plan.mean
 
 

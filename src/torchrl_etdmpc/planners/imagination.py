@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import cast
 
 import torch
@@ -79,6 +80,7 @@ def imagined_returns(
     discount: float,
     all_depths: bool,
     bootstrap: tuple[Tensor, Tensor] | None = None,
+    dtype: torch.dtype | None = None,
 ) -> Tensor:
     """Return table of candidates, each dynamics head on its own rollout (thesis Eq. 3.1).
 
@@ -92,6 +94,7 @@ def imagined_returns(
         all_depths (bool): whether to bootstrap at every depth, or at the last one only.
         bootstrap (tuple of Tensor, optional): with an :class:`~torchrl_etdmpc.modules.ActionValueModel`, what
             :func:`sampled_values` draws with. Default: the model's own values.
+        dtype (torch.dtype, optional): in which returns are summed. Default: that of the model's rewards.
 
     Returns:
         Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for the last depth only; V = 2 with ``bootstrap``.
@@ -100,10 +103,14 @@ def imagined_returns(
     reached = torch.stack(latents if all_depths else latents[-1:])
     if bootstrap is None:
         values = world_model.values(reached)  # [D, F, B, N, V]
+        _check_shape(world_model, "values", values[..., 0], reached.shape[:-1], "[..., V]")
     else:
         values = sampled_values(cast("ActionValueModel", world_model), reached, *bootstrap)
     rewards = _rewards_along(world_model, latent, latents, actions)
     alive = _survival(world_model, latents)
+    if dtype is not None:
+        rewards, values = rewards.to(dtype), values.to(dtype)
+        alive = None if alive is None else alive.to(dtype)
     return return_table(rewards.permute(2, 3, 0, 1), values.permute(2, 3, 0, 1, 4), discount, alive)
 
 
@@ -132,6 +139,8 @@ def _rolled(world_model: PredictionModel, latent: Tensor, actions: Tensor) -> li
     before, latents = latent[None, :, None], []  # at the first step all heads and candidates stand on the same latent
     for step in range(actions.shape[2]):
         before = world_model.next(before, actions[:, :, step])
+        heads = world_model.num_dynamics, *actions.shape[:2], world_model.latent_dim
+        _check_shape(world_model, "next", before, heads, "[F, ..., L]")
         latents.append(before)
     return latents
 
@@ -146,7 +155,9 @@ def _rewards_along(world_model: PredictionModel, latent: Tensor, latents: list[T
     rows = [latent.unsqueeze(1).expand(-1, candidates, -1).flatten(0, 1)]
     rows += [later.flatten(0, -2) for later in latents[:-1]]
     tried = [steps[0].flatten(0, 1), steps[1:].unsqueeze(1).expand(-1, heads, -1, -1, -1).flatten(0, -2)]
-    rewards = world_model.reward(torch.cat(rows), torch.cat(tried))
+    asked = torch.cat(rows)
+    rewards = world_model.reward(asked, torch.cat(tried))
+    _check_shape(world_model, "reward", rewards, asked.shape[:-1], "[...]")
     first, later = rewards[: states * candidates], rewards[states * candidates :]
     return torch.cat(
         [
@@ -162,4 +173,15 @@ def _survival(world_model: PredictionModel, latents: list[Tensor]) -> Tensor | N
     # a calibrated probability counts for what it is.
     predicted = [world_model.termination(latent) for latent in latents]
     ended = [probability for probability in predicted if probability is not None]
+    for probability in ended:
+        _check_shape(world_model, "termination", probability, latents[0].shape[:-1], "[...]")
     return (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1) if ended else None
+
+
+def _check_shape(model: PredictionModel, method: str, result: Tensor, shape: Sequence[int], text: str) -> None:
+    """Names the method of a model that returns another shape than the Protocol says, which would fail far from it."""
+    if result.shape != tuple(shape):
+        raise ValueError(
+            f"{type(model).__name__}.{method} must return {text} for latents [..., L], here {list(shape)}, got "
+            f"{list(result.shape)}."
+        )

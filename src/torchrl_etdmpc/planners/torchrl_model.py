@@ -98,10 +98,18 @@ class TorchRLModel(nn.Module):
     def encode(self, observation: Any) -> Tensor:
         """What the encoder takes, or the states themselves, to latent ``[..., L]``."""
         if isinstance(self.encoder, TensorDictModuleBase):
-            (key,) = self.encoder.in_keys or [self.observation_key]
+            keys = list(map(unravel_key, self.encoder.in_keys)) or [self.observation_key]
+            held = isinstance(observation, TensorDictBase) and all(key in observation.keys(True) for key in keys)
+            if not held and len(keys) > 1:
+                raise ValueError(
+                    f"the encoder reads {keys}, so an observation must be a TensorDict that holds them, got "
+                    f"{type(observation).__name__}; nest them below one key and name it with observation_key=."
+                )
+            read = {key: observation.get(key) for key in keys} if held else {keys[0]: observation}
             first = next(iter(self.encoder.parameters()), observation)
-            batch = observation.shape[:-1] if isinstance(observation, Tensor) else observation.shape
-            return self._joined(self.encoder(TensorDict({key: observation}, batch, device=first.device)))
+            # Which of the dimensions are the batch is the encoder's business.
+            batch = [] if isinstance(observation, Tensor) else observation.shape
+            return self._joined(self.encoder(TensorDict(read, batch, device=first.device)))
         if self.encoder is not None:
             return self.encoder(observation)
         return observation if isinstance(observation, Tensor) else self._joined(observation)
@@ -143,5 +151,9 @@ class TorchRLModel(nn.Module):
                 after = self.model.step(before)
             else:
                 after = self.model(before)
-        after = after.get(NEXT, after)
-        return after.select(*self.state_sizes, self.reward_key).reshape(batch)
+        below: TensorDictBase = after.get(NEXT, after)
+        found = {}
+        for key in (*self.state_sizes, self.reward_key):
+            value = below.get(key, None)
+            found[key] = after.get(key) if value is None else value
+        return TensorDict(found, after.batch_size, device=after.device).reshape(batch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -123,7 +124,8 @@ class ReanalyzeTransform(Transform):
 
         Raises:
             ValueError: if the buffer's writer does not track generations, the buffer prefetches, its storage has more
-                than one dimension, its sampler makes slices of another length, or the transform has a buffer already.
+                than one dimension, its sampler makes slices of another length, the planner has other keys, or the
+                transform has a buffer already.
         """
         if not getattr(replay_buffer.writer, "tracks_generations", False):
             raise ValueError(
@@ -145,6 +147,8 @@ class ReanalyzeTransform(Transform):
                 "this ReanalyzeTransform has a buffer already and would write the targets of one into the other; make "
                 "one for each buffer."
             )
+        self._check_planner("reads", getattr(self.planner, "in_keys", None), [self.observation_key])
+        self._check_planner("writes", getattr(self.planner, "out_keys", None), [*self.plan_keys.values()])
         sampled = _sampled_slice_len(replay_buffer)
         if sampled not in (None, self.slice_len):
             raise ValueError(
@@ -154,6 +158,28 @@ class ReanalyzeTransform(Transform):
         self.__dict__["replay_buffer"] = replay_buffer
         replay_buffer.append_transform(self)
         return self
+
+    def _check_planner(self, what: str, keys: Sequence[NestedKey] | None, own: Sequence[NestedKey]) -> None:
+        """``keys`` may name an entry or one that it is below."""
+        named = {(key,) if isinstance(key, str) else key for key in map(unravel_key, keys or ())}
+        parts = {key: (key,) if isinstance(key, str) else key for key in own}
+        absent = [key for key, path in parts.items() if not any(path[:end] in named for end in range(1, len(path) + 1))]
+        if keys is not None and absent:
+            raise ValueError(
+                f"the planner {what} {', '.join(map(repr, keys))}, but reanalyze needs {', '.join(map(repr, absent))}; "
+                "give it the planner's observation_key and plan_key."
+            )
+
+    def _check_order(self, buffer: TensorDictReplayBuffer) -> None:
+        """A transform that comes later would change what the losses see, and not what the planner has seen."""
+        transforms = list(buffer._transform)
+        for later in transforms[transforms.index(self) + 1 :]:
+            if self.observation_key in map(unravel_key, later.out_keys or ()):
+                raise RuntimeError(
+                    f"{type(later).__name__} changes {self.observation_key!r} after reanalyze has planned from it, so "
+                    "targets would be of other observations than the losses see; append it first, attach reanalyze "
+                    "last."
+                )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Called on every sample ``[B * T]`` or ``[B, T]``; re-plans it if it is its turn.
@@ -180,7 +206,7 @@ class ReanalyzeTransform(Transform):
             TensorDictBase: the sample with its targets refreshed.
 
         Raises:
-            RuntimeError: if the transform is not attached to a buffer.
+            RuntimeError: if the transform is not attached to a buffer, or a later one changes the observation.
             KeyError: if the sample lacks the targets or the index.
         """
         if tensordict.batch_dims > 1:
@@ -188,6 +214,7 @@ class ReanalyzeTransform(Transform):
         buffer = self.replay_buffer
         if buffer is None:
             raise RuntimeError("ReanalyzeTransform has no buffer to write to; use reanalyze.attach(replay_buffer).")
+        self._check_order(buffer)
         index = tensordict.get("index", None)
         missing = [key for key in self.plan_keys.values() if tensordict.get(key, None) is None]
         if index is None or missing:

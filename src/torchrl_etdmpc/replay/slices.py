@@ -111,6 +111,7 @@ class StepSliceSampler(Sampler):
     def _empty(self) -> None:
         self._written = 0  # rows ever written; row r of the storage holds write number r modulo the capacity
         self._newest: int | Tensor | None = None  # row of the last write, once there is one
+        self._loaded = False  # and nothing written since
         self._followed = 0  # rows that are in the table
         self._trajectories = Trajectories()
         self._starts: tuple[np.ndarray, np.ndarray] | None = None  # of the rows that were followed
@@ -120,11 +121,13 @@ class StepSliceSampler(Sampler):
         """Is called by the replay buffer after one row was written."""
         self._written += 1
         self._newest = index
+        self._loaded = False
 
     def extend(self, index: Tensor) -> None:
         """Is called by the replay buffer after several rows were written."""
         self._written += len(index)
         self._newest = index[-1]
+        self._loaded = False
 
     def end_episodes(self, rows: int | Tensor, storage: TensorStorage) -> None:
         """Is called after the last rows of running episodes were made their ends, as after a fault.
@@ -248,9 +251,9 @@ class StepSliceSampler(Sampler):
         if self._newest is None:
             self._newest = self._written - 1
         newest = self._newest = int(self._newest)  # waits once per write
-        # In a full ring the number of rows no longer tells of foreign writes, but the storage's cursor does. It is not
-        # known of a storage that was loaded.
-        cursor = storage._last_cursor_index if self._written >= capacity else None
+        # In a full ring the number of rows no longer tells of foreign writes, but the storage's cursor does. After
+        # loading it is not known, or still that of the rows before.
+        cursor = storage._last_cursor_index if self._written >= capacity and not self._loaded else None
         missed = cursor is not None and int(cursor) != newest % capacity
         if stored == min(self._written, capacity) and not (newest + 1 - self._written) % capacity and not missed:
             return
@@ -297,7 +300,10 @@ class StepSliceSampler(Sampler):
         for key in (*keys, self.init_key, self.done_key, self.mask_key):
             column = stored.get(key, None)
             if column is not None:
-                values[key] = column[index].reshape(number, -1)
+                column = column[index].reshape(number, -1)
+                # Joined to one table below, where a single float32 column would round the ids of the others.
+                kind = torch.bool if key not in keys else torch.float64 if column.is_floating_point() else torch.int64
+                values[key] = column.to(kind)
         table = torch.cat(list(values.values()), -1).cpu().numpy()  # one wait for the device
         begin_column = 0
         for key, column in values.items():
@@ -333,6 +339,7 @@ class StepSliceSampler(Sampler):
         self._written = int(state_dict["written"])
         self._followed = int(state_dict["followed"])
         self._trajectories.load_state_dict(state_dict)
+        self._loaded = True
 
     def dumps(self, path: str | Path) -> None:
         """Writes :meth:`state_dict` to ``path/slices.pt``."""
