@@ -144,13 +144,17 @@ def test_methods_with_other_checkpoints_meet_on_the_shared_grid():
 
 
 def test_seeds_with_other_checkpoints_than_each_other_have_their_own_areas():
-    one, other = (
-        seed_curves("odd", lambda *_: 400.0, seeds=(n,), steps=s) for n, s in ((1, STEPS), (2, (0, 5e4, 2e5)))
-    )
+    one = seed_curves("odd", lambda *_: 400.0, seeds=(1,), steps=STEPS)
+    other = seed_curves("odd", lambda *_: 200.0, seeds=(2,), steps=(0, 5e4, 2e5))
+    late = seed_curves("odd", lambda *_: 600.0, seeds=(3,), steps=(0, 4e4, 199_000, 201_000))
     comparison = run(pd.concat([OURS, one, other]))
+    assert cell(comparison.areas, "odd", "walker-run")["auc"] == pytest.approx(0.15)
+    assert cell(comparison.areas, "odd", "walker-run")["seeds"] == 2
+    assert cell(comparison.finals, "odd", "walker-run")["mean"] == pytest.approx(300)
+    comparison = run(pd.concat([OURS, one, other, late]))
     assert cell(comparison.areas, "odd", "walker-run")["auc"] == pytest.approx(0.2)
-    assert cell(comparison.areas, "odd", "walker-run")["standard_error"] == pytest.approx(0)
-    assert cell(comparison.areas, "odd", "walker-run")["seeds"] == 1  # in between only one of them was evaluated
+    assert cell(comparison.finals, "odd", "walker-run")["mean"] == pytest.approx(400)
+    assert cell(comparison.finals, "odd", "walker-run")["seeds"] == 3
 
 
 def test_the_grid_starts_where_all_methods_have_begun():
@@ -253,7 +257,7 @@ def test_a_return_that_is_not_a_number_is_left_out_and_counted():
 
 def test_missing_evaluations_of_a_seed_are_noted():
     gap = OURS[~((OURS["seed"] == 3) & (OURS["env_steps"] == 50_000) & (OURS["task"] == "walker-run"))]
-    note = "ours: not all seeds have every evaluation on walker-run; each mean is of those that have it."
+    note = "ours: not all seeds begin and end alike on walker-run; each mean is of those that reach there."
     assert note in run(gap).notes
 
 

@@ -73,9 +73,9 @@ def test_runs_meet_by_task_and_seed_and_one_without_a_partner_is_left_out_and_co
     runs = {("new", "x", 1): 10.0, ("new", "x", 2): 20.0, ("new", "x", 3): 999.0}
     runs |= {("base", "x", 2): 5.0, ("base", "x", 1): 1.0, ("base", "y", 1): 7.0, ("other", "x", 1): -50.0}
     table = compare(curves(runs))
-    assert list(table.index) == ["x", "All tasks"]  # y has no pair
+    assert list(table.index) == ["x", "All tasks (1 of 2 tasks)"]  # y has no pair
     assert table.loc["x", ["pairs", "left_out", "difference"]].tolist() == [2, 1, pytest.approx(12)]
-    assert table.loc["All tasks", ["pairs", "left_out"]].tolist() == [2, 2]
+    assert table.loc["All tasks (1 of 2 tasks)", ["pairs", "left_out"]].tolist() == [2, 2]
 
 
 def test_every_task_counts_alike_and_the_bootstrap_is_stratified():

@@ -26,12 +26,12 @@ NAMES = [name for name in get_args(StudyName) if name != "all"]
 FEW = ("episodes=2", "states=6", "device=cpu", "seed=4")
 
 
-def untrained(folder: Path, *, num_dynamics: int) -> Path:
-    """An agent of small networks, whose episodes have 30 decisions."""
+def untrained(folder: Path, *, num_dynamics: int, task: str = "cartpole-balance", observation_dim: int = 5) -> Path:
+    """An agent of small networks, whose episodes have 30 decisions at most."""
     config = TrainConfig.from_dict(
         {
-            "task": "cartpole-balance",
-            "episode_length": 60,
+            "task": task,
+            "episode_length": 60 if task == "cartpole-balance" else None,
             "compile": "off",
             "model": {"latent_dim": 16, "mlp_dim": 16, "encoder_dim": 16, "num_dynamics": num_dynamics},
             "planner": {"horizon": 2, "num_samples": 8, "num_elites": 4, "num_proposals": 2, "iterations": 1},
@@ -39,7 +39,7 @@ def untrained(folder: Path, *, num_dynamics: int) -> Path:
         }
     )
     torch.manual_seed(0)
-    agent = build_agent(config, observation_dim=5, action_dim=1)
+    agent = build_agent(config, observation_dim=observation_dim, action_dim=1)
     return save_agent(folder / "last.pt", agent, config, {"env_steps": 400})
 
 
@@ -172,3 +172,16 @@ def test_episodes_that_are_too_short_are_refused(checkpoint, study):
         "error: states must be at least 1 and have 6 decisions after them, got states=6 and episodes of at most 4 "
         "decisions; take longer episodes."
     )
+
+
+def test_episodes_that_end_early_count_as_long_as_they_were(tmp_path, study):
+    pytest.importorskip("gymnasium")
+    checkpoint = untrained(tmp_path, num_dynamics=2, task="gym/InvertedPendulum-v5", observation_dim=4)
+    message, out, _ = study("all", f"checkpoint={checkpoint}", *FEW, "out=st")
+    assert message is None
+    about = json.loads(Path("st", "cross_scoring.json").read_text(encoding="utf-8"))
+    assert about["mean_return"] < 100  # of 1,000 decisions, each of which is worth 1
+    true = [row for row in rows(Path("st", "cross_scoring.csv")) if row["scored_by"] == "simulator"]
+    assert all(abs(float(row["gain"])) < 100 for row in true)
+    assert "value_bias: left out" not in out
+    assert "advantage: left out" not in out

@@ -176,9 +176,22 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, sav
     agent, config, _ = load_agent(checkpoint)
     first = evaluate(make_env(config.task_spec, seed=0), BarePolicy(agent.world_model), episodes=1).returns
     assert first.item() < 200  # every decision upright is worth 1
-    env = make_env(config.task_spec, seed=0)
-    env.reset()  # as the script does, to see whether this machine can render
-    assert films == [len(env.rollout(1000, BarePolicy(agent.world_model)))]
+    envs = make_env(config.task_spec, seed=0, num_envs=3, parallel=False)
+    assert films == [evaluate(envs, BarePolicy(agent.world_model), episodes=3).lengths[0].item()]
+
+
+@pytest.mark.parametrize("policy", ["bare", "planner"])
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, save_untrained, policy, episodes):
+    checkpoint = save_untrained(tmp_path, 5, task="cartpole-balance")
+    picture = torch.zeros(2, 2, 3, dtype=torch.uint8)
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.render_frame", lambda env: picture)
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.write_film", lambda *_, **__: None)
+    same = [f"checkpoint={checkpoint}", f"episodes={episodes}", f"policy={policy}", "device=cpu", "seed=3"]
+    same.append("task.episode_length=60")
+    for more in (["csv=without.csv"], ["csv=with.csv", "video=a.mp4"]):
+        assert run_main(*same, *more)[0] is None
+    assert Path("with.csv").read_text() == Path("without.csv").read_text()
 
 
 @pytest.mark.parametrize(

@@ -415,8 +415,8 @@ def test_a_run_that_has_only_begun_is_left_out_and_named(run_main, refused, capf
     out, err = capfd.readouterr()
     assert out == (
         "1 run on 1 task of Easy DMC, up to 100,000 env steps, compared at 100,000, which all of them reach (the "
-        "benchmark's budget is 200,000); 1 missing or unfinished (cpu on walker-walk with seed 1: ends at 0 env steps, "
-        "others at 100,000); the report is report/index.md\n"
+        "benchmark's budget is 200,000); 1 missing or unfinished (cpu on walker-walk with seed 1: no evaluation "
+        "after 0 env steps); the report is report/index.md\n"
     )
     assert err == ""
 
@@ -616,3 +616,66 @@ def test_a_thousand_runs_have_a_report_in_less_than_a_minute():
     # of the processor, on which other work may run beside
     (seconds,) = re.findall(r"^1008 runs: [\d.]+ s, ([\d.]+) s of the processor;", process.stdout, re.M)
     assert float(seconds) < 60
+
+
+def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
+    make_run("runs/a")
+    with open("runs/a/config.yaml", "a") as file:
+        file.write("episode_length: 100\n")
+    run_main("runs", "--out", "out")
+    page = Path("out", "index.md").read_text()
+    assert "- walker-walk was run with episode_length=100, not as the benchmark has it.\n" in page
+    assert "- Nothing published stands beside walker-walk: returns of other episodes do not compare.\n" in page
+    assert "BMPC |" not in page
+    assert not Path("out", "aggregate.png").exists()
+
+
+def test_runs_of_one_name_on_other_versions_of_a_task_are_not_averaged(refused):
+    make_run("runs/a")
+    make_run("runs/b", seed=2)
+    with open("runs/b/config.yaml", "a") as file:
+        file.write("episode_length: 100\n")
+    assert refused("runs") == (
+        "runs of cpu on walker-walk with the task's own settings and episode_length=100: runs/a and runs/b; give one "
+        "of them a name of its own."
+    )
+
+
+def test_what_could_not_be_read_is_named_on_the_page(run_main, capfd):
+    make_run("runs/a")
+    make_run("runs/b", seed=2, text=HEADER + "0,0,7,1.0,much,0.5,10\n")
+    run_main("runs", "--out", "out")
+    assert "- skipped runs/b: " in Path("out", "index.md").read_text()
+
+
+def test_a_folder_that_is_named_twice_counts_once(run_main, capfd):
+    make_run("runs/a")
+    run_main("runs", "runs/a", "runs/../runs/a")
+    assert capfd.readouterr().out.startswith("1 run on 1 task of Easy DMC")
+
+
+def test_a_file_of_baselines_may_have_numbers_for_names_and_says_if_it_is_of_no_use(run_main, capfd):
+    make_run("runs/a")
+    rows = [f"64,{task},1,{step},{step / 100}" for task in ("walker-walk",) for step in (50_000, 100_000, 200_000)]
+    Path("own.csv").write_text("\n".join(["method,task,seed,env_steps,return_mean", *rows, ""]))
+    Path("other.csv").write_text(Path("own.csv").read_text().replace("walker-walk", "walker_walk"))
+    run_main("runs", "--reference", "own.csv", "other.csv", "--out", "out")
+    text = "other.csv has no curve on a task of dmc-easy, its tasks are walker_walk: left out"
+    assert text in capfd.readouterr().err
+    page = Path("out", "index.md").read_text()
+    assert "| 64 | " in page
+    assert f"- {text}\n" in page
+
+
+def test_a_bar_in_a_name_makes_no_column(run_main):
+    make_run("runs/a")
+    make_run("runs/b", seed=2)
+    run_main("x|y=runs/a", "z=runs/b", "--out", "out")
+    for table in Path("out", "index.md").read_text().split("\n\n"):
+        lines = [line for line in table.splitlines() if line.startswith("|")]
+        assert len({line.replace("\\|", "").count("|") for line in lines}) <= 1, table
+
+
+def test_a_budget_without_a_grid_is_refused(refused):
+    make_run("runs/a")
+    assert refused("runs", "--budget", "49999") == "--budget=49999 has no grid of equal steps; take 49998 or 50000."

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from torchrl_etdmpc.analysis.benchmarks import Benchmark
+from torchrl_etdmpc.analysis.curves import SEED_COLUMNS
 from torchrl_etdmpc.analysis.paired import compare_paired
 from torchrl_etdmpc.analysis.statistics import (
     NORMALISER,
@@ -19,6 +20,7 @@ from torchrl_etdmpc.analysis.statistics import (
     interpolate,
     normalise,
     normalisers,
+    seed_estimates,
     shared_grid,
 )
 from torchrl_etdmpc.analysis.steps import STEPS, no_points, returns_at
@@ -95,6 +97,30 @@ def merge_estimates(seed_curves: pd.DataFrame, means: pd.DataFrame) -> pd.DataFr
     return pd.concat([part for part in (table, rest) if len(part)] or [table], ignore_index=True)
 
 
+def on_common_steps(seed_curves: pd.DataFrame) -> pd.DataFrame:
+    """Every seed's curve at all steps of its method on the task that lie within its own evaluations.
+
+    Between two evaluations a return lies on the straight line. Where seeds were evaluated at other steps than each
+    other, a mean would otherwise be of whoever happened to be evaluated there.
+
+    Args:
+        seed_curves (DataFrame): ``method, task, seed, env_steps, return_mean``; NaN returns are left out.
+
+    >>> rows = [("a", "t", 1, 10, 0.0), ("a", "t", 1, 30, 2.0), ("a", "t", 2, 20, 5.0)]
+    >>> curves = pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])
+    >>> on_common_steps(curves)["return_mean"].tolist()
+    [0.0, 1.0, 2.0, 5.0]
+    """
+    parts = []
+    for _, curves in seed_curves.dropna(subset="return_mean").groupby(["method", "task"], sort=False):
+        steps = np.unique(curves["env_steps"])
+        if len(curves) < len(steps) * curves["seed"].nunique():
+            lines = interpolate(seed_estimates(curves), steps).dropna(subset="mean")
+            curves = lines.rename(columns={"mean": "return_mean"})[[*SEED_COLUMNS]]
+        parts.append(curves)
+    return pd.concat(parts, ignore_index=True) if parts else seed_curves
+
+
 def compare(
     seed_curves: pd.DataFrame,
     means: pd.DataFrame,
@@ -123,7 +149,8 @@ def compare(
         grid_step (int): env steps between the points of the shared grid.
         start (int, optional): first point of the grid. Default: the first that all methods have.
         from_zero (bool): draws a line from the evaluation of the untrained agent to the next one, see
-            :func:`interpolate`; for the thesis' own tables only.
+            :func:`interpolate`, and takes each mean over the seeds that were evaluated there, not over
+            :func:`on_common_steps`; for the thesis' own tables only.
         points (DataFrame, optional): quoted means, see :func:`read_points`.
         steps (sequence of int): env steps at which returns are tabled, those within the budget.
         base (str, optional): with which ``variants`` are compared, paired by task and seed.
@@ -142,7 +169,7 @@ def compare(
     """
     tasks = tuple(tasks or benchmark.tasks)
     budget = budget or benchmark.budget
-    estimates = merge_estimates(seed_curves, means)
+    estimates = merge_estimates(seed_curves if from_zero else on_common_steps(seed_curves), means)
     points = no_points() if points is None else points
     points = points[points["task"].isin(tasks) & (points["env_steps"] <= budget)].reset_index(drop=True)
     constants = normalisers(estimates[estimates["task"].isin(benchmark.tasks)], benchmark.budget)
@@ -235,8 +262,11 @@ def _notes(
         yield f"{method}: one seed on {', '.join(rows['task'])}; a mean of one run, no interval."
     for method, rows in counts[counts["min"] < counts["max"]].groupby("method", sort=False):
         where = ", ".join(rows["task"])
-        yield f"{method}: not all seeds have every evaluation on {where}; each mean is of those that have it."
-    unknown = [name for name in methods if areas[areas["method"] == name]["standard_error"].isna().all()]
+        yield f"{method}: not all seeds begin and end alike on {where}; each mean is of those that reach there."
+    known = areas[areas["auc"].notna()]
+    unknown = [
+        name for name in dict.fromkeys(known["method"]) if known[known["method"] == name]["standard_error"].isna().all()
+    ]
     if unknown:
         yield f"No interval of the AUC for {', '.join(unknown)}: it needs the curves of at least two seeds."
     there = set(zip(*(estimates[estimates["env_steps"] == budget][name] for name in ("method", "task")), strict=True))

@@ -27,6 +27,8 @@ from torchrl_etdmpc.runs import RunDirectory
 SEED_COLUMNS = ("method", "task", "seed", "env_steps", "return_mean")
 POINT_COLUMNS = ("method", "task", "env_steps", "mean", "source")
 ESTIMATE_COLUMNS = ("method", "task", "env_steps", "mean", "standard_error", "seeds")
+CHANGED = ("action_repeat", "episode_length")
+"""Settings of a task that a run may change, by their names in ``config.yaml``."""
 _EVAL = RunDirectory("").eval.name
 _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
 
@@ -72,6 +74,7 @@ class Run:
         seed (int): its seed.
         finished (bool): whether it reached its budget.
         curve (DataFrame): seed curve, see :func:`read_run`.
+        changed (tuple of str): settings of the task that are not its own, e.g. ``episode_length=100``.
 
     >>> Run(Path("runs/a/seed1"), "ours", "walker-walk", 1, True, pd.DataFrame()).method
     'ours'
@@ -83,16 +86,19 @@ class Run:
     seed: int
     finished: bool
     curve: pd.DataFrame
+    changed: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, run_dir: str | os.PathLike[str], *, method: str | None = None) -> Run:
         """Reads the files of a run; see :func:`read_run`."""
         directory, header, table = RunDirectory(run_dir), read_header(run_dir), read_evaluations(run_dir)
-        repeat = header.pop("action_repeat")
-        _check_units(table.assign(task=header["task"]), directory.eval, repeat)
+        settings = {name: header[name] for name in CHANGED if header[name] is not None}
+        _check_units(table.assign(task=header["task"]), directory.eval, settings.get("action_repeat"))
         names = {"method": method or header["preset"], "task": header["task"], "seed": header["seed"]}
         columns = {name: table[name].astype(float) for name in ("env_steps", "return_mean")}
-        return cls(directory.path, **names, finished=directory.finished, curve=pd.DataFrame({**names, **columns}))
+        curve = pd.DataFrame({**names, **columns})
+        changed = tuple(f"{name}={value}" for name, value in settings.items())
+        return cls(directory.path, **names, finished=directory.finished, curve=curve, changed=changed)
 
     @property
     def last(self) -> float:
@@ -130,7 +136,7 @@ def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> p
 
 
 def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
-    """Task, preset and seed of a run, and its action repeat where it is not the task's own (otherwise ``None``).
+    """Task, preset and seed of a run, and what it changes of its task: ``CHANGED``, ``None`` for the task's own.
 
     Raises:
         FileNotFoundError: if it has neither ``config.yaml`` nor ``summary.json``.
@@ -153,8 +159,7 @@ def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
     kinds = {"task": str, "preset": str, "seed": int}
     if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
         raise ValueError(f"{files[0]} does not give the run's task, preset and seed.")
-    repeat = values.get("action_repeat")
-    return header | {"action_repeat": repeat if type(repeat) is int else None}
+    return header | {name: values[name] if type(values.get(name)) is int else None for name in CHANGED}
 
 
 def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
@@ -195,14 +200,22 @@ def join_runs(runs: Iterable[Run]) -> pd.DataFrame:
     """The seed curves of runs, at least one.
 
     Raises:
-        ValueError: two runs of the same method, task and seed.
+        ValueError: two runs of the same method, task and seed, or of the same method and task but with other settings
+            of the task.
 
     >>> curve = {"method": "ours", "task": "walker-walk", "seed": 1, "env_steps": [0, 10], "return_mean": 1.0}
     >>> len(join_runs([Run(Path("a"), "ours", "walker-walk", 1, True, pd.DataFrame(curve))]))
     2
     """
-    tables, seen = [], {}
+    tables, seen, first = [], {}, {}
     for run in runs:
+        other = first.setdefault((run.method, run.task), run)
+        if run.changed != other.changed:
+            kinds = " and ".join(", ".join(one.changed) or "the task's own settings" for one in (other, run))
+            raise ValueError(
+                f"runs of {run.method} on {run.task} with {kinds}: {other.path} and {run.path}; give one of them a "
+                "name of its own."
+            )
         key = (run.method, run.task, run.seed)
         if key in seen:
             raise ValueError(
@@ -326,7 +339,7 @@ def _parse(text: str, file: Path, columns: tuple[str, ...], *, empty: bool = Fal
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # rows longer than the header
-            table = pd.read_csv(io.StringIO(text), index_col=False)
+            table = pd.read_csv(io.StringIO(text), index_col=False, dtype={"method": str, "task": str})
     except (ValueError, pd.errors.ParserWarning) as error:
         if empty and not text.strip():
             return pd.DataFrame(columns=list(columns), dtype=float)

@@ -94,6 +94,8 @@ def compare_paired(
         if found:
             over = np.mean([values for _, values in found], 0)
             pairs, name = sum(count for count, _ in found), AGGREGATE if normalised else ALL_TASKS
+            if len(found) < len(tasks):
+                name = f"{name} ({len(found)} of {len(tasks)} tasks)"
             rows.append((variant, base, name, pairs, left_out, *_interval(over[0]), *_interval(over[1])))
     return pd.DataFrame(rows, columns=list(PAIRED_COLUMNS))
 
@@ -121,7 +123,7 @@ def paired_markdown(table: pd.DataFrame) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for row in table.itertuples():
-        digits = 3 if row.task == AGGREGATE else 1
+        digits = 3 if row.task.startswith(AGGREGATE) else 1
         difference = _quote(f"+.{digits}f", row.difference, row.lower, row.upper)
         improvement = _quote(".2f", row.improvement, row.improvement_lower, row.improvement_upper)
         names = " | ".join(str(name).replace("|", "\\|") for name in (row.variant, row.base, row.task))

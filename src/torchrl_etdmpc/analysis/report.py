@@ -25,9 +25,12 @@ from torchrl_etdmpc.analysis.statistics import (
     interpolate,
     normalise,
 )
-from torchrl_etdmpc.analysis.steps import MEAN, overview, step_table
+from torchrl_etdmpc.analysis.steps import MEAN, escape, overview, step_table
 from torchrl_etdmpc.analysis.tables import AGGREGATE, result_table, to_csv, to_markdown
 from torchrl_etdmpc.runs.files import replacing
+
+FIGURES = ("curves", "aggregate", "auc")
+"""The last two only where something normalises the tasks."""
 
 
 def write_report(
@@ -77,9 +80,10 @@ def write_report(
             stack.enter_context(replacing(out / name)).write_bytes(content)
     for name in {"returns.csv", "paired.csv"} - set(contents):  # of an earlier report, of other data
         (out / name).unlink(missing_ok=True)
-    for ending in {"pdf", "svg"} - {vector}:
-        for name in figures:
-            (out / f"{name}.{ending}").unlink(missing_ok=True)
+    for name in FIGURES:
+        for ending in ("png", "pdf", "svg"):
+            if f"{name}.{ending}" not in contents:
+                (out / f"{name}.{ending}").unlink(missing_ok=True)
     return out / "index.md"
 
 
@@ -94,6 +98,11 @@ def _picture(figure: Figure, name: str, ending: str) -> bytes:
 def _wide(comparison: Comparison, values: pd.DataFrame, column: str) -> list[pd.DataFrame]:
     shape = {"tasks": comparison.tasks, "methods": comparison.methods}
     return [result_table(values, column=name, **shape) for name in (column, "seeds", "standard_error")]
+
+
+def _normalised(comparison: Comparison) -> bool:
+    """Whether something normalises one of the tasks."""
+    return any(task in comparison.constants.index for task in comparison.tasks)
 
 
 def _tables(comparison: Comparison) -> dict[str, str]:
@@ -124,8 +133,11 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     points = aggregate(normalise(points, comparison.constants), comparison.tasks)
     areas = comparison.areas[comparison.areas["task"] == AGGREGATE]
     options = {"methods": comparison.methods, "budget": comparison.budget}
+    learned = plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options)
+    if not _normalised(comparison):
+        return {"curves": learned}
     return {
-        "curves": plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options),
+        "curves": learned,
         "aggregate": plot_aggregate(curves, ylabel=normalised, points=points, **options),
         "auc": plot_auc(areas, methods=comparison.methods, ylabel="normalised AUC"),
     }
@@ -136,7 +148,7 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
     count, total = len(comparison.tasks), len(benchmark.tasks)
     scope = f"all {total} tasks" if count == total else f"{count} of its {total} tasks, over which aggregates are taken"
     normalised = "Nothing normalises these tasks, so that areas and aggregates are unavailable. "
-    if len(comparison.constants):
+    if _normalised(comparison):
         by = f"{NORMALISER}'s mean return on the task at {benchmark.budget:,} env steps"
         normalised = f"Normalised by {by}. "
     parts = [
@@ -152,14 +164,16 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
         _paired(comparison),
         "## Area under the normalised learning curve\n",
         files["auc.md"],
-        f"![areas](auc.png)\n\n## Return at {comparison.budget:,} environment steps\n",
+        "![areas](auc.png)\n" if _normalised(comparison) else "",
+        f"## Return at {comparison.budget:,} environment steps\n",
         "Of runs and published curves; the last row is the mean of normalised returns.\n",
         files["final.md"],
         "## Learning curves\n",
         "Mean over seeds; shaded: 95% interval, 1.96 standard errors. A line begins at the first evaluation of the "
         "trained agent; a marker at 0 is the untrained one. Hollow markers are quoted, and belong to no line. The "
         "aggregate has what is known on every task; a single value is a marker with its interval.\n",
-        "![learning curves](curves.png)\n\n![aggregate](aggregate.png)\n",
+        "![learning curves](curves.png)\n",
+        "![aggregate](aggregate.png)\n" if _normalised(comparison) else "",
         _intervals(comparison),
         _robust(comparison),
     ]
@@ -216,7 +230,7 @@ def _same_tasks(comparison: Comparison) -> str:
         ours = ours[ours["task"].isin(rows["task"])]
         if method != first and len(rows) < len(comparison.tasks) and len(ours) == len(rows):
             lines.append(
-                f"- On the {len(rows)} tasks of {method} at {step:,.0f}: {method} {rows['mean'].mean():.0f}, "
+                f"- On {_tasks(len(rows))} of {method} at {step:,.0f}: {method} {rows['mean'].mean():.0f}, "
                 f"{first} {ours['mean'].mean():.0f}.\n"
             )
     return "".join(lines)
@@ -227,7 +241,8 @@ def _paired(comparison: Comparison) -> str:
     if table.empty:
         return ""
     against = f"{table['base'].iloc[0]}, paired by task and seed, at {comparison.budget:,} environment steps"
-    over = "Over tasks, differences are of normalised returns. " if (table["task"] == AGGREGATE).any() else ""
+    normalised = table["task"].str.startswith(AGGREGATE).any()
+    over = "Over tasks, differences are of normalised returns. " if normalised else ""
     text = (
         "Difference of returns, and probability that a run of the variant scores more than one of the base (ties "
         f"half), of the runs that both have with the same task and seed. {over}In brackets: 95% percentile interval of "
@@ -249,7 +264,7 @@ def _intervals(comparison: Comparison) -> str:
     for task in comparison.tasks:
         for row in table[table["task"] == task].itertuples():
             lines.append(
-                f"| {task} | {row.method} | {row.mean:.1f} | {row.std:.1f} | {row.standard_error:.1f} | "
+                f"| {task} | {escape(row.method)} | {row.mean:.1f} | {row.std:.1f} | {row.standard_error:.1f} | "
                 f"{row.lower:.1f} to {row.upper:.1f} | {row.seeds:.0f} |"
             )
     return "\n".join(lines) + "\n"
@@ -262,12 +277,13 @@ def _robust(comparison: Comparison) -> str:
     complete = {method: found for method, found in scores.items() if set(found) == set(comparison.tasks)}
     if not complete:
         return ""
+    others = " | ".join(f"P(> {escape(name)})" for name in complete)
     lines = [
         f"## Interquartile mean of normalised scores at {comparison.budget:,} environment steps\n",
         "95% percentile intervals of a stratified bootstrap (2,000 resamples of the seeds within each task); P is the "
         "probability that a run of the row's method scores more than one of the column's, averaged over tasks. Only "
         "methods whose runs are known per seed on all tasks.\n",
-        "| method | interquartile mean | " + " | ".join(f"P(> {name})" for name in complete) + " | seeds per task |",
+        f"| method | interquartile mean | {others} | seeds per task |",
         "|---" * (len(complete) + 3) + "|",
     ]
     for method, found in complete.items():
@@ -276,9 +292,8 @@ def _robust(comparison: Comparison) -> str:
             "" if other == method else _quote(probability_of_improvement(found, complete[other])) for other in complete
         ]
         counts = sorted({len(values) for values in found.values()})
-        lines.append(
-            f"| {method} | " + " | ".join(cells) + f" | {' to '.join(map(str, counts[:: max(len(counts) - 1, 1)]))} |"
-        )
+        seeds = " to ".join(map(str, counts[:: max(len(counts) - 1, 1)]))
+        lines.append(f"| {escape(method)} | {' | '.join(cells)} | {seeds} |")
     return "\n".join(lines) + "\n"
 
 

@@ -97,7 +97,7 @@ def step_table(returns: pd.DataFrame, step: float, *, tasks: Sequence[str], meth
     columns = [method for method in methods if method in set(here["method"])]
     rows = {(row.method, row.task): row for row in here.itertuples()}
     quoted = set(here[here["kind"] == "quoted"]["method"])
-    heads = [_escape(method) + " (quoted)" * (method in quoted) for method in columns]
+    heads = [escape(method) + " (quoted)" * (method in quoted) for method in columns]
     lines = ["| task | " + " | ".join(heads) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in [*tasks, MEAN]:
         cells = [_cell(rows.get((method, task)), len(tasks) if task == MEAN else 1) for method in columns]
@@ -126,7 +126,7 @@ def overview(returns: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[s
     lines = ["| method | " + " | ".join(f"{step:,.0f}" for step in steps) + " |", "|---" * (1 + len(steps)) + "|"]
     for method in shown:
         cells = [_cell(rows.get((method, step)), len(tasks)) for step in steps]
-        lines.append(f"| {_escape(method)}{' (quoted)' * (method in quoted)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {escape(method)}{' (quoted)' * (method in quoted)} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -142,5 +142,6 @@ def _cell(row, tasks: int) -> str:
     return text + (f", {row.tasks} of {tasks} tasks" if row.tasks < tasks else "")
 
 
-def _escape(name: str) -> str:
+def escape(name: str) -> str:
+    """A name within a row of a Markdown table."""
     return name.replace("|", "\\|")

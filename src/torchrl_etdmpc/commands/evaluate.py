@@ -10,6 +10,7 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
@@ -65,8 +66,7 @@ def main(config: EvaluateConfig) -> None:
             _make_folder(Path(file).expanduser())
     device = resolve_device(config.device)
     task = config.task_spec
-    # A film needs the one environment that it shows; otherwise the episodes run side by side.
-    env = make_env(task, seed=config.seed, num_envs=1 if config.video else config.episodes, parallel=False)
+    env = make_env(task, seed=config.seed, num_envs=config.episodes, parallel=False)  # side by side
     agent, trained, counters = load_agent(
         config.checkpoint,
         observation_dim=env.observation_spec["observation"].shape[-1],
@@ -88,14 +88,15 @@ def main(config: EvaluateConfig) -> None:
     def film(step: TensorDictBase) -> None:
         nonlocal ended
         if not ended:
-            frames.append(render_frame(env, *size))
-            ended = bool(step["next", "done"].any())
+            frames.append(render_frame(_first(env), *size))
+            ended = bool(step["next", "done"].reshape(-1)[0])
 
     if config.video:
         env.reset()
         # Fails here, before the episodes, if this machine cannot render or lacks what writes a film.
-        render_frame(env, *size)
+        render_frame(_first(env), *size)
         film_writer(config.video)
+        env.set_seed(config.seed)  # the episodes are those that are played without a film
     played = evaluate(
         env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
     )
@@ -107,6 +108,13 @@ def main(config: EvaluateConfig) -> None:
     files = [f"; {what} in {file}" for what, file in (("film", config.video), ("episodes", config.csv)) if file]
     elsewhere = "" if task.name == trained.task else f"on {trained.task} "
     print(_outcome(config, task, played, f"{elsewhere}for {counters['env_steps']}") + "".join(files))
+
+
+def _first(env: EnvBase) -> EnvBase:
+    """The first of environments that run side by side, or the only one."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env._envs[0] if isinstance(env, SerialEnv) else env
 
 
 def _make_folder(file: Path) -> None:

@@ -12,6 +12,7 @@ given (`NAME=PATH`), and the variant below a folder with an experiment.yaml.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import sys
 import time
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 Table = Any  # of pandas, which is imported where it is used
 REFERENCE = Path(__file__).resolve().parents[1] / "analysis" / "reference"
+DEFAULT_REFERENCES = tuple(REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget"))
 DEFAULT_GRID_STEP = 100_000
 
 
@@ -43,8 +45,8 @@ def parse() -> argparse.Namespace:
         "--reference",
         nargs="*",
         metavar="CSV",
-        default=[REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget")],
-        help="files of baselines, per seed or as means; none for no baselines (default: BMPC, TD-MPC2, DR.Q, ...)",
+        default=DEFAULT_REFERENCES,
+        help="files of baselines, per seed or as means, in the place of BMPC, TD-MPC2, DR.Q, ...; none: no baselines",
     )
     parser.add_argument(
         "--points",
@@ -102,9 +104,13 @@ def read(arguments: argparse.Namespace) -> tuple[list[Run], Table, list[Experime
     runs: list[Run] = []
     broken: dict[Path, Exception] = {}
     roots: dict[Path, None] = {}
+    known: set[tuple[str | None, Path]] = set()
     for argument in arguments.runs:
         name, path = named(argument)
         for folder in find_runs([path]):
+            if (name, folder.resolve()) in known:  # below two of the arguments
+                continue
+            known.add((name, folder.resolve()))
             root = None if name else experiment_root(folder)
             if root is not None and (root == Path(path) or Path(path) in root.parents):
                 roots[root] = None
@@ -153,6 +159,8 @@ def choose_budget(
         first = begins(runs).max()
         steps = [budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0]
         step = next((step for step in steps if step >= first), steps[-1] if steps else None)
+        if step is None and arguments.budget:
+            raise ValueError(f"--budget={budget} has no grid of equal steps; take {budget - 1} or {budget + 1}.")
         if step is None:
             budget, step = budget - 1, (budget - 1) // 2
     return budget, arguments.grid_step or step
@@ -204,10 +212,18 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     planned = dict.fromkeys(variant for plan in experiments for variant in plan.variants)  # in their own order
     methods = [name for name in dict.fromkeys([*planned, *chosen["method"]]) if name in set(chosen["method"])]
     budget, grid_step = choose_budget(arguments, benchmark, chosen, experiments)
+    # Published returns are of whole episodes.
+    changed = {run.task: ", ".join(run.changed) for run in found if run.changed and run.task in tasks}
+    shorter = {task for task, settings in changed.items() if "episode_length" in settings}
     seeds, means = [chosen], []
-    for table in references:
+    for file, table in zip(arguments.reference, references, strict=True):
         known = table[table["task"].isin(benchmark.tasks)]
-        (seeds if "return_mean" in table else means).append(known)
+        if known.empty and file not in DEFAULT_REFERENCES:
+            names = ", ".join(dict.fromkeys(table["task"]))
+            lines.append(f"{file} has no curve on a task of {benchmark.name}, its tasks are {names}: left out")
+            print(lines[-1], file=sys.stderr, flush=True)
+        (seeds if "return_mean" in table else means).append(known[~known["task"].isin(shorter)])
+    points = points[~points["task"].isin(shorter)]
     refuse_clash(methods, [*means, *seeds[1:], points])
     curves = join_curves(seeds)
     published = join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"])
@@ -225,7 +241,15 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         points=points,
         **choose_base(arguments, chosen, methods, experiments),
     )
-    incomplete = incomplete_runs(found, experiments)
+    notes = [f"{task} was run with {settings}, not as the benchmark has it." for task, settings in changed.items()]
+    if shorter:
+        where = ", ".join(sorted(shorter))
+        notes.append(f"Nothing published stands beside {where}: returns of other episodes do not compare.")
+    notes += [
+        f"The experiment's base {plan.base} has no runs here." for plan in experiments if plan.base not in methods
+    ]
+    comparison = dataclasses.replace(comparison, notes=(*comparison.notes, *notes))
+    incomplete = [*lines, *incomplete_runs(found, experiments)]
     page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector, incomplete=incomplete)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]
     last = chosen["env_steps"].max()

@@ -144,13 +144,14 @@ def _study(
     config: StudyConfig,
 ) -> Any:
     """The study's result, from states that have as many decisions after them as it looks ahead."""
-    decisions = simulator.task.decision_steps_per_episode
-    window = min(50, decisions // 2)
+    # Of the episodes that were played, which may have ended before their time limit.
+    decisions = round(sum(len(episode.reward) for episode in episodes) / len(episodes))
+    window = max(min(50, decisions // 2), 1)
     ahead = {
         "cross_scoring": 3,
         "latent_gallery": planner.horizon,
         "calibration": 6,
-        "value_bias": decisions // 2,  # so that what the time limit cut off weighs little
+        "value_bias": max(decisions // 2, 1),  # so that what the time limit cut off weighs little
         "advantage": window,
     }
     states = choose_states(episodes, config.states, ahead=ahead.get(name, 1), seed=config.seed)
