@@ -172,7 +172,7 @@ class ReanalyzeTransform(Transform):
 
     def _check_order(self, buffer: TensorDictReplayBuffer) -> None:
         """A transform that comes later would change what the losses see, and not what the planner has seen."""
-        transforms = list(buffer._transform)
+        transforms: list[Transform] = list(buffer._transform)  # pyright: ignore[reportArgumentType]  # a Compose
         for later in transforms[transforms.index(self) + 1 :]:
             if self.observation_key in map(unravel_key, later.out_keys or ()):
                 raise RuntimeError(
