@@ -81,15 +81,15 @@ def mean_over_tasks(differences: pd.Series) -> tuple[float, float]:
 
 
 def groups(tasks: pd.Index) -> dict[str, pd.Index]:
-    """The tasks of the experiment, those that the preset was tuned on, the others, and all."""
+    """All tasks; those of the experiment, those that the preset was tuned on and the others, where that is a part."""
     chosen = read_experiment(EXPERIMENT).tasks
     parts = {
+        "all": tasks,
         "those of the experiment": tasks[tasks.isin(chosen)],
         "tuned on": tasks[tasks.isin(TASKS)],
         "not tuned on": tasks[~tasks.isin(TASKS)],
-        "all": tasks,
     }
-    return {name: part for name, part in parts.items() if len(part)}
+    return {name: part for name, part in parts.items() if name == "all" or 0 < len(part) < len(tasks)}
 
 
 def report(pairs: pd.DataFrame) -> str:

@@ -1,0 +1,66 @@
+"""Differences of variants from the cpu preset, from the files of runs whose returns are known."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("pandas")
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+def write(folder: Path, returns: dict[int, float]) -> None:
+    folder.mkdir(parents=True)
+    task, seed = folder.parent.name, folder.name.removeprefix("seed")
+    (folder / "summary.json").write_text(f'{{"task": "{task}", "preset": "cpu", "seed": {seed}}}')
+    rows = [f"{step},{step // 2},{step},1.0,{value},1.0,10" for step, value in returns.items()]
+    header = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes"
+    (folder / "eval.csv").write_text("\n".join([header, *rows, ""]))
+
+
+@pytest.fixture
+def script(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    module = importlib.import_module("ablation")
+    monkeypatch.setattr(module, "RESULTS", tmp_path)
+    monkeypatch.setattr(module, "FOLDER", tmp_path / "ablation")
+    return module
+
+
+def test_runs_are_paired_by_task_and_seed_and_tasks_count_alike(script, tmp_path, monkeypatch):
+    steps = list(script.STEPS)
+    gains = {"walker-run": [10.0, 30.0], "walker-walk": [100.0], "hopper-stand": [0.0]}
+    for task, seeds in gains.items():
+        for seed, gain in enumerate(seeds, start=1):
+            write(tmp_path / task / f"seed{seed}", dict.fromkeys([0, *steps], 200.0))
+            later = {step: 200 + gain * step / steps[-1] for step in [0, *steps]}
+            write(tmp_path / "ablation" / "one head" / task / f"seed{seed}", later)
+    write(tmp_path / "ablation" / "one head" / "cheetah-run" / "seed1", dict.fromkeys(steps, 900.0))  # has no partner
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only"])
+    script.main()
+    page = (tmp_path / "ablation" / "README.md").read_text()
+    # 20, 100 and 0 by task: mean 40, deviation 52.9, Student's t of two degrees of freedom 4.303.
+    assert "| all | 3 | +8 [-18, +34] | +16 [-37, +69] | +24 [-55, +103] | +32 [-73, +137] | +40 [-91, +171] |" in page
+    assert "| tuned on | 1 | +20 | +40 | +60 | +80 | +100 |" in page
+    assert "| walker-run | 1, 2 | 200 | 220 | +20 |" in page
+    assert "cheetah-run" not in page
+    assert (tmp_path / "ablation" / "differences.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_kept_of_the_experiment_s_runs_leaves_the_base_out(script, tmp_path):
+    for variant in ("cpu", "no reanalyze"):
+        write(tmp_path / "runs" / variant / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
+    script.collect(tmp_path / "runs")
+    found = sorted(str(file.relative_to(script.FOLDER)) for file in script.FOLDER.rglob("*") if file.is_file())
+    assert found == [f"no reanalyze/walker-run/seed1/{name}" for name in ("eval.csv", "summary.json")]
+
+
+def test_without_a_pair_there_is_one_line(script, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only"])
+    with pytest.raises(SystemExit, match=r"^error: no runs under .* run this script without --report-only first\.$"):
+        script.main()
