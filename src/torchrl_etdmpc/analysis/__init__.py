@@ -21,7 +21,14 @@ from torchrl_etdmpc.analysis.benchmarks import (
     get_benchmark,
     own_benchmark,
 )
-from torchrl_etdmpc.analysis.comparison import Comparison, begins, compare, evaluated_methods, merge_estimates
+from torchrl_etdmpc.analysis.comparison import (
+    Comparison,
+    begins,
+    compare,
+    evaluated_methods,
+    merge_estimates,
+    on_common_steps,
+)
 from torchrl_etdmpc.analysis.curves import (
     Run,
     find_runs,
@@ -86,6 +93,7 @@ __all__ = [
     "merge_estimates",
     "method_styles",
     "no_points",
+    "on_common_steps",
     "normalise",
     "normalisers",
     "own_benchmark",
