@@ -47,7 +47,8 @@ def test_auto_compiles_where_a_compiler_exists(monkeypatch, setting, device, com
 def test_auto_does_not_compile_what_is_over_sooner_without(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
     cpu, cuda = torch.device("cpu"), torch.device("cuda")
-    assert resolve_compile("auto", cpu, 9_999) is None
+    assert resolve_compile("auto", cpu, 5_999) is None
+    assert resolve_compile("auto", cpu, 6_000) == "default"
     assert resolve_compile("auto", cuda, 1) == "reduce-overhead"
     assert resolve_compile("default", cpu, 1) == "default"
 
