@@ -4,8 +4,8 @@ import http.server
 import importlib.util
 import math
 import os
-import time
 import threading
+import time
 from pathlib import Path
 
 import pytest
