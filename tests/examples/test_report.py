@@ -664,7 +664,8 @@ def test_a_file_of_baselines_may_have_numbers_for_names_and_says_if_it_is_of_no_
     assert text in capfd.readouterr().err
     page = Path("out", "index.md").read_text()
     assert "| 64 | " in page
-    assert f"- {text}\n" in page
+    assert f"- {text}.\n" in page
+    assert "Missing and unfinished" not in page
 
 
 def test_a_bar_in_a_name_makes_no_column(run_main):

@@ -179,5 +179,5 @@ def test_half_precision_leaves_the_discount_as_it_is():
     assert (loss.discount.item(), loss.rho.item()) == pytest.approx((0.995, 0.3), rel=1e-7)
     batch = random_slices(5, 3, num_slices=4, slice_len=3)
     assert torch.isfinite(loss(batch.apply(lambda x: x.bfloat16() if x.is_floating_point() else x))["loss_value"])
-    loss.double()
-    assert loss.discount.dtype == torch.float64
+    for dtype in (torch.float64, torch.float32):
+        assert loss.to(dtype).discount.dtype == dtype

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs import EnvBase, ExplorationType
+from torchrl.envs import EnvBase, ExplorationType, TensorDictPrimer
 from torchrl.envs.utils import set_exploration_type
 
 
@@ -61,10 +61,7 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
-    make_primer = getattr(policy, "make_tensordict_primer", None)
-    check = None if make_primer is None else getattr(make_primer(), "check", None)
-    if check is not None:
-        check(env)
+    fitting_primer(env, policy)
     num_envs = max(env.batch_size.numel(), 1)
     if policy_device is not None and torch.device(policy_device) == env.device:
         policy_device = None
@@ -74,6 +71,20 @@ def evaluate(
             rounds.append(_round(env, policy, num_envs, policy_device, on_step))
     returns, lengths = (torch.cat(parts)[:episodes] for parts in zip(*rounds, strict=True))
     return Episodes(returns, lengths)
+
+
+def fitting_primer(env: EnvBase, policy: nn.Module) -> TensorDictPrimer | None:
+    """The policy's primer, if it has one; one that knows what its policy's model takes compares it first.
+
+    Raises:
+        ValueError: if environment and model do not fit.
+    """
+    make_primer = getattr(policy, "make_tensordict_primer", None)
+    primer = None if make_primer is None else make_primer()
+    check = getattr(primer, "check", None)
+    if check is not None:
+        check(env)
+    return primer
 
 
 def _round(

@@ -16,6 +16,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
+from torchrl_etdmpc.collectors.evaluate import fitting_primer
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.worker import start_workers_anew
 from torchrl_etdmpc.keys import TRAJECTORY
@@ -357,18 +358,9 @@ def _truncate(rows: TensorDictBase) -> None:
 
 
 def _with_primer(env: EnvBase, policy: nn.Module) -> EnvBase:
-    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already.
-
-    A primer that knows what its policy's model takes compares it with the environment first.
-    """
-    make_primer = getattr(policy, "make_tensordict_primer", None)
-    if make_primer is None:
-        return env
-    primer = make_primer()
-    check = getattr(primer, "check", None)
-    if check is not None:
-        check(env)
-    if not getattr(policy, "warm_start", True):
+    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already."""
+    primer = fitting_primer(env, policy)
+    if primer is None or not getattr(policy, "warm_start", True):
         return env
     present = set(env.full_observation_spec.keys(True, True)) | set(env.full_state_spec.keys(True, True))
     if all(unravel_key(key) in present for key in primer.primers.keys(True, True)):

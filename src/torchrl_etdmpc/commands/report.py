@@ -215,13 +215,13 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     # Published returns are of whole episodes.
     changed = {run.task: ", ".join(run.changed) for run in found if run.changed and run.task in tasks}
     shorter = {task for task, settings in changed.items() if "episode_length" in settings}
-    seeds, means = [chosen], []
+    seeds, means, unused = [chosen], [], []
     for file, table in zip(arguments.reference, references, strict=True):
         known = table[table["task"].isin(benchmark.tasks)]
         if known.empty and file not in DEFAULT_REFERENCES:
             names = ", ".join(dict.fromkeys(table["task"]))
-            lines.append(f"{file} has no curve on a task of {benchmark.name}, its tasks are {names}: left out")
-            print(lines[-1], file=sys.stderr, flush=True)
+            unused.append(f"{file} has no curve on a task of {benchmark.name}, its tasks are {names}: left out")
+            print(unused[-1], file=sys.stderr, flush=True)
         (seeds if "return_mean" in table else means).append(known[~known["task"].isin(shorter)])
     points = points[~points["task"].isin(shorter)]
     refuse_clash(methods, [*means, *seeds[1:], points])
@@ -241,12 +241,15 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         points=points,
         **choose_base(arguments, chosen, methods, experiments),
     )
-    notes = [f"{task} was run with {settings}, not as the benchmark has it." for task, settings in changed.items()]
+    notes = [f"{line}." for line in unused]
+    notes += [f"{task} was run with {settings}, not as the benchmark has it." for task, settings in changed.items()]
     if shorter:
         where = ", ".join(sorted(shorter))
         notes.append(f"Nothing published stands beside {where}: returns of other episodes do not compare.")
     notes += [
-        f"The experiment's base {plan.base} has no runs here." for plan in experiments if plan.base not in methods
+        f"The experiment's base {plan.base} has no runs here."
+        for plan in experiments
+        if plan.base and plan.base not in methods
     ]
     comparison = dataclasses.replace(comparison, notes=(*comparison.notes, *notes))
     incomplete = [*lines, *incomplete_runs(found, experiments)]

@@ -103,7 +103,7 @@ def imagined_returns(
     reached = torch.stack(latents if all_depths else latents[-1:])
     if bootstrap is None:
         values = world_model.values(reached)  # [D, F, B, N, V]
-        _check_shape(world_model, "values", values[..., 0], reached.shape[:-1], "[..., V]")
+        _check_shape(world_model, "values", values.shape, (*reached.shape[:-1], *values.shape[-1:]), "[..., V]")
     else:
         values = sampled_values(cast("ActionValueModel", world_model), reached, *bootstrap)
     rewards = _rewards_along(world_model, latent, latents, actions)
@@ -140,7 +140,7 @@ def _rolled(world_model: PredictionModel, latent: Tensor, actions: Tensor) -> li
     for step in range(actions.shape[2]):
         before = world_model.next(before, actions[:, :, step])
         heads = world_model.num_dynamics, *actions.shape[:2], world_model.latent_dim
-        _check_shape(world_model, "next", before, heads, "[F, ..., L]")
+        _check_shape(world_model, "next", before.shape, heads, "[F, ..., L]")
         latents.append(before)
     return latents
 
@@ -157,7 +157,7 @@ def _rewards_along(world_model: PredictionModel, latent: Tensor, latents: list[T
     tried = [steps[0].flatten(0, 1), steps[1:].unsqueeze(1).expand(-1, heads, -1, -1, -1).flatten(0, -2)]
     asked = torch.cat(rows)
     rewards = world_model.reward(asked, torch.cat(tried))
-    _check_shape(world_model, "reward", rewards, asked.shape[:-1], "[...]")
+    _check_shape(world_model, "reward", rewards.shape, asked.shape[:-1], "[...]")
     first, later = rewards[: states * candidates], rewards[states * candidates :]
     return torch.cat(
         [
@@ -174,14 +174,14 @@ def _survival(world_model: PredictionModel, latents: list[Tensor]) -> Tensor | N
     predicted = [world_model.termination(latent) for latent in latents]
     ended = [probability for probability in predicted if probability is not None]
     for probability in ended:
-        _check_shape(world_model, "termination", probability, latents[0].shape[:-1], "[...]")
+        _check_shape(world_model, "termination", probability.shape, latents[0].shape[:-1], "[...]")
     return (1 - torch.stack(ended)).cumprod(0).permute(2, 3, 0, 1) if ended else None
 
 
-def _check_shape(model: PredictionModel, method: str, result: Tensor, shape: Sequence[int], text: str) -> None:
+def _check_shape(model: PredictionModel, method: str, found: torch.Size, shape: Sequence[int], text: str) -> None:
     """Names the method of a model that returns another shape than the Protocol says, which would fail far from it."""
-    if result.shape != tuple(shape):
+    if found != tuple(shape):
         raise ValueError(
             f"{type(model).__name__}.{method} must return {text} for latents [..., L], here {list(shape)}, got "
-            f"{list(result.shape)}."
+            f"{list(found)}."
         )
