@@ -27,14 +27,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import torch
 from cpu_learning import RESULTS
 from dm_control import suite
 from matplotlib.figure import Figure
 from tensordict.nn import TensorDictModule
 
-from torchrl_etdmpc.analysis import estimate, method_styles, read_runs
-from torchrl_etdmpc.analysis.statistics import Z_95
+from torchrl_etdmpc.analysis import Run, add_interval, estimate, find_runs, join_runs, method_styles
+from torchrl_etdmpc.analysis.curves import read_evaluations
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import get_task, make_env
 from torchrl_etdmpc.envs.dmc import domain_and_task
@@ -120,9 +121,9 @@ def train(task: str, algorithm: str, settings: str, seed: int, target: Path, env
 
     def note() -> float:
         with torch.random.fork_rng([]):
-            torch.manual_seed(seed)
-            starts.set_seed(seed)
-            returns = evaluate(starts, policy, episodes=EPISODES)
+            torch.manual_seed(seed + 10_000)  # the episodes on which a run of ours with this seed is evaluated
+            starts.set_seed(seed + 10_000)
+            returns = evaluate(starts, policy, episodes=EPISODES).returns
         steps = model.num_timesteps
         counters = {"env_steps": steps * repeat, "decision_steps": steps, "updates": model._n_updates}
         row = {"return_mean": returns.mean().item(), "return_std": returns.std(correction=0).item()}
@@ -144,13 +145,13 @@ def train(task: str, algorithm: str, settings: str, seed: int, target: Path, env
 
 def report(ours: list[Path]) -> str:
     """Figure and table of every method over env steps and over minutes."""
-    curves = read_runs([FOLDER, *ours])
-    curves = curves[curves["task"].isin(TASKS)]
+    runs = [run for run in map(Run.read, find_runs([FOLDER, *ours])) if run.task in TASKS and run.finished]
+    curves = join_runs(runs)
     methods = [*sorted(set(curves["method"]) - {"cpu"}), "cpu"]
     styles = method_styles(methods)
-    timed = curves.assign(minutes=curves["wall_time_s"] / 60)
-    minutes = timed.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
-    found = estimate(curves).join(minutes, on=["task", "method", "env_steps"])
+    clocks = [read_evaluations(run.path).assign(task=run.task, method=run.method) for run in runs]
+    minutes = pd.concat(clocks).groupby(["task", "method", "env_steps"])["wall_time_s"].mean().div(60).rename("minutes")
+    found = add_interval(estimate(curves)).join(minutes, on=["task", "method", "env_steps"])
     tasks = [task for task in TASKS if task in set(found["task"])]
     figure = Figure(figsize=(3.1 * len(tasks), 5.2), layout="constrained")
     axes = figure.subplots(2, len(tasks), squeeze=False, sharey=True)
@@ -160,11 +161,7 @@ def report(ours: list[Path]) -> str:
             for method in methods:
                 line = found[(found["task"] == task) & (found["method"] == method) & (found["env_steps"] > 0)]
                 axis.plot(line[x], line["mean"], label=method, linewidth=1.6, **styles[method])
-                if line["se"].notna().all():
-                    spread = Z_95 * line["se"]
-                    axis.fill_between(
-                        line[x], line["mean"] - spread, line["mean"] + spread, color=styles[method]["color"], alpha=0.15
-                    )
+                axis.fill_between(line[x], line["lower"], line["upper"], color=styles[method]["color"], alpha=0.15)
             axis.set(title=task if row == 0 else None, xlabel=("env steps", "minutes on one core")[row])
             axis.grid(alpha=0.3)
     for axis in axes[:, 0]:
