@@ -257,7 +257,8 @@ TABLE = {
     ("RayCollector", "single", FLAT): JOINED,
     ("one Collector per worker", "single", FLAT): JOINED,
 }
-SLOW = {"MultiSyncCollector", "MultiAsyncCollector", "RayCollector"}  # starting processes takes ten seconds
+# Starting processes takes ten seconds.
+SLOW = {"ParallelEnv", "MultiSyncCollector", "MultiAsyncCollector", "RayCollector"}
 
 
 def _cells():

@@ -124,6 +124,16 @@ def test_runs_are_found_at_any_depth_sorted_and_once(tmp_path):
     assert find_runs([str(tmp_path / "a")]) == expected[:1]
 
 
+def test_runs_behind_links_are_found_and_each_of_them_once(tmp_path):
+    runs, elsewhere = tmp_path / "runs", tmp_path / "elsewhere"
+    make_run(elsewhere / "b", HEADER)
+    make_run(runs / "c", HEADER)
+    (runs / "b").symlink_to(elsewhere / "b")
+    (runs / "a").symlink_to(runs / "c")
+    (runs / "c" / "back").symlink_to(runs)
+    assert find_runs([runs]) == [runs / "b", runs / "c"]
+
+
 def test_a_path_that_does_not_exist_is_an_error(tmp_path):
     make_run(tmp_path / "a", HEADER)
     with pytest.raises(FileNotFoundError, match=re.escape(f"no such run directory: {tmp_path / 'b'}")):

@@ -662,6 +662,21 @@ def test_a_collector_that_has_not_acted_can_be_saved_even_if_its_workers_rescale
     second.shutdown()
 
 
+def test_a_simulator_that_cannot_tell_its_state_does_not_keep_the_rest_from_being_saved(monkeypatch):
+    def fail(env: EnvBase) -> None:
+        raise RuntimeError("At least one process failed\nTraceback")
+
+    first, second = (StepCollector(make_env(), RandomActions(), replay_buffer=make_replay()) for _ in range(2))
+    first.step()
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", fail)
+    with pytest.warns(UserWarning, match=r"cannot tell its state \(At least one process failed\): a run that goes on"):
+        state = first.state_dict()
+    with pytest.warns(UserWarning, match="the environment cannot be restored, so fresh episodes begin"):
+        second.load_state_dict(state)
+    second.step()
+    assert second.frames == 2
+
+
 def _make_rescaled() -> TransformedEnv:
     return TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
 

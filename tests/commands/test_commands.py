@@ -123,7 +123,9 @@ def test_a_missing_renderer_does_not_hurt_a_run_that_renders_nothing(tmp_path):
     assert err.startswith("error: total_env_steps must exceed the random phase")  # it came as far as the settings
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "delay", [pytest.param(0.0, marks=pytest.mark.slow), 0.3, pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_ctrl_c_while_pytorch_is_imported_is_one_line(delay):
     process = start("task=walker-walk", "preset=cpu", "total_env_steps=1")
     libraries = Path(f"/proc/{process.pid}/maps")

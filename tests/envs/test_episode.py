@@ -59,6 +59,7 @@ def test_another_environment_goes_on_where_the_first_one_was(task, num_envs, par
     resume(task, num_envs, parallel, steps)
 
 
+@pytest.mark.slow  # worker processes start four times
 def test_worker_processes_go_on_where_the_first_ones_were():
     resume("walker-walk", 2, True, 2 * LIMIT + 3)
 

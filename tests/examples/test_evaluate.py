@@ -104,6 +104,22 @@ def test_the_table_says_which_episodes_are_a_success(tmp_path, monkeypatch, chec
     )
 
 
+def test_a_film_that_cannot_be_written_costs_no_returns(tmp_path, monkeypatch, checkpoint, run_main):
+    def fail(*args, **options) -> None:
+        raise OSError("path=film.mp4 cannot be written (No space left on device).")
+
+    where = "torchrl_etdmpc.commands.evaluate."
+    monkeypatch.setattr(where + "render_frame", lambda *args: torch.zeros(3, 2, 2))
+    monkeypatch.setattr(where + "film_writer", lambda path: None)
+    monkeypatch.setattr(where + "write_film", fail)
+    message, out, _ = run_main(
+        f"checkpoint={checkpoint}", "episodes=2", "policy=bare", "device=cpu", "csv=a.csv", "video=film.mp4"
+    )
+    assert message == "error: path=film.mp4 cannot be written (No space left on device)."
+    assert out.endswith(" over 2 episodes; episodes in a.csv\n")
+    assert len((tmp_path / "a.csv").read_text().splitlines()) == 3
+
+
 def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_main):
     message, out, err = run_main(
         f"checkpoint={checkpoint}", "task=cartpole-swingup", "episodes=1", "policy=bare", "device=cpu"

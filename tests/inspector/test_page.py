@@ -128,6 +128,11 @@ def test_a_port_in_use_is_one_line():
             serve(None, port=port)
 
 
+def test_an_address_of_another_machine_is_one_line():
+    with pytest.raises(OSError, match=r"^host=192\.0\.2\.1 is no address of this machine \(.*\)\.$"):
+        serve(None, host="192.0.2.1", allow_remote=True)
+
+
 def wait_for(condition: Callable[[], Any], what: str, seconds: float = 30) -> Any:
     end = time.monotonic() + seconds
     while time.monotonic() < end:

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import errno
+import io
 import re
 import sys
 import warnings
 
+import pytest
 from torchrl import torchrl_logger
 
 from torchrl_etdmpc.runs import console
@@ -47,3 +50,14 @@ def test_without_tqdm_there_are_lines_too(monkeypatch, capsys):
     with console():
         torchrl_logger.warning("a word")
     assert capsys.readouterr().out.endswith(" a word\n")
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), BrokenPipeError(), ValueError()])
+def test_what_cannot_be_shown_ends_nothing(monkeypatch, error):
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise error
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    with console():
+        torchrl_logger.warning("a word")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
 from pathlib import Path
@@ -119,6 +120,22 @@ def test_a_logger_gets_the_same_numbers_and_is_closed_once(log):
     log.finish({})
     log.close()
     assert recorder.closed
+
+
+def test_a_logger_on_a_full_disk_costs_its_own_rows_alone(tmp_path, log):
+    class Full:
+        def log_metrics(self, *_, **__) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        shutdown = log_metrics
+
+    log.logger = Full()
+    with pytest.warns(UserWarning, match=r"^Full failed \(No space left on device\) and misses rows, which are in "):
+        log.log_train({"loss": 0.25}, **COUNTERS)
+    assert len(read_csv(log.directory.train)) == 2
+    with pytest.warns(UserWarning, match="^Full failed"):
+        log.finish({})
+    assert log.directory.finished
 
 
 def test_finish_writes_valid_json_with_null_for_what_is_not_finite(tmp_path, log):

@@ -110,6 +110,8 @@ def test_settings_of_the_command_come_after_those_of_every_variant(write):
         ({"seeds": True}, "seeds of .* must be a list of numbers or how many, got True."),
         ({"seeds": [2, 2]}, "seeds of experiment mine must differ, got .2. more than once."),
         ({"variants": None}, "variants of experiment mine must not be empty."),
+        ({"variants": {False: {}}}, "variants of .*mine.yaml must have texts for names, got False; put it in quotes."),
+        ({"variants": {1.0: {}}}, "variants of .*mine.yaml must have texts for names, got 1.0; put it in quotes."),
         ({"variants": ["a"]}, "variants of .*mine.yaml must be settings by name, got .'a'."),
         ({"variants": {"a": 3}}, "variant a of .*mine.yaml must be settings by name, got 3."),
         ({"variants": {"a/b": {}}}, "a variant's name becomes a folder's: .*, got 'a/b'."),

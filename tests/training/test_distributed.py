@@ -98,11 +98,14 @@ class Workers:
 def started(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Workers]]:
     """Replaces processes by workers in this one; returns those that were started, as they are."""
 
-    def replace(*, error: BaseException | None = None, fails_at: int = 0) -> list[Workers]:
+    def replace(
+        *, error: BaseException | None = None, fails_at: int = 0, again: BaseException | None = None
+    ) -> list[Workers]:
         every: list[Workers] = []
 
         def start(parts, *, engine: str, numbers: range, rows: int) -> Any:
-            every.append(Workers(parts, numbers, rows, None if every else error, fails_at))
+            fails = {0: (error, fails_at), 1: (again, 0)}.get(len(every), (None, 0))
+            every.append(Workers(parts, numbers, rows, *fails))
             return every[-1]
 
         monkeypatch.setattr(distributed, "start_workers", start)
@@ -218,6 +221,20 @@ def test_after_a_failure_other_workers_go_on_in_fresh_episodes(started):
     learner.collector.shutdown()
 
 
+def test_workers_that_fail_while_they_are_started_anew_are_one_failure_more(started):
+    errors = RuntimeError("the physics is invalid"), RuntimeError("Cannot allocate memory")
+    workers, learner = started(error=errors[0], fails_at=8, again=errors[1]), learner_of(config_of())
+    explore_and_pretrain(learner)
+    with pytest.warns(UserWarning, match="a worker failed: ") as warned:
+        while len(workers) < 3:
+            learner.step(updates=True)
+    assert [str(error) in str(warning.message) for error, warning in zip(errors, warned, strict=True)] == [True, True]
+    frames = learner.collector.frames
+    learner.step(updates=True)
+    assert learner.collector.frames > frames
+    learner.collector.shutdown()
+
+
 def test_a_worker_that_fails_before_its_first_rows_ends_the_run(started):
     started(error=ValueError("no such simulator\nmore"))
     learner = learner_of(config_of())
@@ -233,15 +250,18 @@ def test_rows_that_are_not_finite_are_not_stored(started):
     next_rows = iter(workers[0])
 
     def broken() -> Iterator[TensorDictBase]:
-        rows = next(next_rows)
-        rows["next", "reward"][3] = math.nan
-        yield rows
+        for key in ("plan", "value"), ("next", "reward"):
+            rows = next(next_rows)
+            rows[key][3] = math.nan
+            yield rows
 
     learner.collector._batches = broken()
+    learner.step()  # a plan that fell back has no value
+    assert len(learner.replay) == 16
     learner.collector.act()
-    with pytest.raises(NonFiniteError, match=r"worker 0 sent a non-finite \('next', 'reward'\) after 8 decisions"):
+    with pytest.raises(NonFiniteError, match=r"worker 0 sent a non-finite \('next', 'reward'\) after 16 decisions"):
         learner.collector.finish_step()
-    assert len(learner.replay) == 8 and workers[0].closed
+    assert len(learner.replay) == 16 and workers[0].closed
     learner.collector.shutdown()
 
 

@@ -116,6 +116,7 @@ print(torch._dynamo.utils.counters["stats"]["unique_graphs"], _graphs_not_in_the
 """
 
 
+@pytest.mark.slow  # compiles in an empty cache
 @needs_compiler
 def test_what_a_helper_compiles_the_process_that_it_helps_finds_in_the_cache(tmp_path, tiny_config):
     config = tiny_config(compile="default", planner={"horizon": 1, "num_proposals": 0})

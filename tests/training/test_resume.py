@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 from torch.utils._pytree import tree_map_only
+from torchrl.checkpoint import GlobalRNGState
 
 pytest.importorskip("dm_control")
 
@@ -370,6 +371,16 @@ def test_a_save_that_failed_half_way_leaves_nothing_out_of_the_next_one(tmp_path
     assert resumed.env_steps == 48
     expected, actual = (one.learner.replay[:] for one in (run, resumed))
     assert (expected == actual).all()
+
+
+def test_a_run_goes_on_where_there_are_fewer_gpus(tmp_path, monkeypatch, small_config, make_run):
+    plain = GlobalRNGState.state_dict
+    device = torch.cuda.get_rng_state() if torch.cuda.is_available() else torch.zeros(16, dtype=torch.uint8)
+    monkeypatch.setattr(GlobalRNGState, "state_dict", lambda self: plain(self) | {"torch_cuda": 99 * [device]})
+    make_run(small_config(), tmp_path / "run").run()
+    with pytest.warns(UserWarning, match=r"saved on a machine with 99 GPUs, here are \d+: it goes on with "):
+        resumed = make_run(small_config(total_env_steps=180), tmp_path / "run", resume=True)
+    assert resumed.run()["env_steps"] == 180
 
 
 def fill(disk: Path) -> None:

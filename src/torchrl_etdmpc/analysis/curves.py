@@ -56,11 +56,26 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     for path in map(Path, paths):
         if not path.exists():
             raise FileNotFoundError(f"no such run directory: {path}.")
-        found = {file.parent for file in path.rglob(_EVAL)}
+        found = _folders_with(_EVAL, path)
         if not found:
             raise FileNotFoundError(f"no runs found in {path}; a run directory holds an {_EVAL}.")
         runs |= found
     return sorted(runs)
+
+
+def _folders_with(name: str, path: Path) -> set[Path]:
+    """Also behind links to folders, each of them once."""
+    found, seen = {}, set()
+    for folder, folders, files in os.walk(path, followlinks=True):
+        folders.sort(key=lambda inner: (os.path.islink(os.path.join(folder, inner)), inner))  # links come last
+        real = os.path.realpath(folder)
+        if real in seen:  # a link that leads back
+            folders.clear()
+            continue
+        seen.add(real)
+        if name in files:
+            found[real] = Path(folder)
+    return set(found.values())
 
 
 @dataclass(frozen=True)

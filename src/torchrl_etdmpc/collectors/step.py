@@ -299,6 +299,17 @@ class StepCollector(BaseCollector):
         """The seed policy while it acts, if it has a state: TorchRL's ``RandomPolicy`` is no module."""
         return self.seed_policy if self.in_seed_phase and isinstance(self.seed_policy, nn.Module) else None
 
+    def _simulator_state(self) -> dict[str, Any] | None:
+        try:
+            return simulator_state(self.env)
+        except Exception as error:  # of a worker process that is gone: the next step finds it and starts others
+            warnings.warn(
+                f"the simulator cannot tell its state ({first_line(error)}): a run that goes on from here begins fresh "
+                "episodes.",
+                stacklevel=3,
+            )
+            return None
+
     def state_dict(self) -> OrderedDict:
         """Counters, the place in the running episodes, the simulator's included, and in the seed phase its policy's.
 
@@ -308,7 +319,7 @@ class StepCollector(BaseCollector):
         return OrderedDict(
             frames=self._frames,
             next_trajectory=self._next_trajectory,
-            simulator=simulator_state(self.env),
+            simulator=self._simulator_state(),
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
             seed_policy=seeding.state_dict() if (seeding := self._seeding_module()) else None,

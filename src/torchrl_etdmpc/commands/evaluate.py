@@ -100,14 +100,18 @@ def main(config: EvaluateConfig) -> None:
     played = evaluate(
         env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
     )
-    if config.video:
-        write_film(frames, config.video, fps=FRAMES_PER_SECOND)
-    if config.csv:
-        write_whole(Path(config.csv).expanduser(), _table(task, played))
     env.close(raise_if_closed=False)
-    files = [f"; {what} in {file}" for what, file in (("film", config.video), ("episodes", config.csv)) if file]
     elsewhere = "" if task.name == trained.task else f"on {trained.task} "
-    print(_outcome(config, task, played, f"{elsewhere}for {counters['env_steps']}") + "".join(files))
+    told = _outcome(config, task, played, f"{elsewhere}for {counters['env_steps']}")
+    try:
+        if config.csv:
+            write_whole(Path(config.csv).expanduser(), _table(task, played))
+            told += f"; episodes in {config.csv}"
+        if config.video:
+            write_film(frames, config.video, fps=FRAMES_PER_SECOND)
+            told += f"; film in {config.video}"
+    finally:  # on a full disk, too
+        print(told)
 
 
 def _first(env: EnvBase) -> EnvBase:

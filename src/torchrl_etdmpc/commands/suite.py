@@ -60,6 +60,10 @@ INSTEAD = {
 """Settings of train that a command line of a suite must not hold, and what to write."""
 
 
+OF_ENGINE = {"local": ("per_gpu",), "ray": ("address", "cpus_per_run", "gpus_per_run"), "slurm": ("sbatch",)}
+"""Settings that one engine alone has."""
+
+
 @dataclass(frozen=True)
 class SuiteConfig:
     """What is to be run, where and how."""
@@ -101,6 +105,10 @@ class SuiteConfig:
             number = getattr(self, name)
             if number is not None and number < least:
                 raise ValueError(f"{name} must be at least {least}, got {number}.")
+        for engine, names in OF_ENGINE.items():
+            for name in names if engine != self.engine else ():
+                if getattr(self, name) != getattr(SuiteConfig, name):
+                    raise ValueError(f"{name} is for engine={engine}; leave it out with engine={self.engine}.")
 
 
 @one_line_errors
@@ -230,6 +238,8 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
         if not equals:
             continue
         name = f"task.{name}" if f"task.{name}" in training else name
+        if not text and name in ("tasks", "seeds", "variants"):  # of an unset variable of the shell
+            raise ValueError(f"{name} must not be empty; leave it out for all that the experiment has.")
         if name in own:
             values[name] = text if own[name].is_text or own[name].choices else _value(text)
         elif name in training:

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 
 # How long a worker process may take for a step, in seconds.
 _PATIENCE_S = 300
-# How long a worker process outlives a signal to stop, in seconds.
+# How often a worker process looks for its owner after a signal to stop, in seconds.
 _GRACE_S = 10
 _SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)}
 
@@ -87,7 +87,7 @@ def start_workers_anew(env: EnvBase) -> bool:
 
 
 def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
-    """In a worker process, leaves the ``owner`` time to finish its step and save after a signal to stop.
+    """In a worker process: a signal to stop is left to the ``owner``, who finishes its step, saves and ends the worker.
 
     Job schedulers signal all processes of a job at once, as Ctrl-C does. TorchRL calls this once in the owner's process
     too.
@@ -95,9 +95,21 @@ def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
     process = multiprocessing.parent_process()
     if process is not None and os.getpid() != owner:
         sys.stderr = SilentWithoutOwner(sys.stderr, process.sentinel)
-    if os.getpid() != owner and hasattr(signal, "SIGALRM"):
-        take_signals(lambda *_: signal.alarm(_GRACE_S))
+        if hasattr(signal, "SIGALRM"):
+            _outlive_signals(process.sentinel)
     return make(device="cpu")
+
+
+def _outlive_signals(owner: int) -> None:
+    """After a signal to stop, ends this process once its owner is gone; saving may take the owner a while."""
+
+    def look(*_: Any) -> None:
+        if multiprocessing.connection.wait([owner], 0):
+            os._exit(1)
+        signal.alarm(_GRACE_S)
+
+    signal.signal(signal.SIGALRM, look)
+    take_signals(lambda *_: signal.alarm(_GRACE_S))
 
 
 class SilentWithoutOwner:

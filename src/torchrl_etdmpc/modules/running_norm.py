@@ -26,7 +26,7 @@ class RunningNorm(nn.Module):
     Args:
         size (int): O.
 
-    >>> norm = RunningNorm(2)  # as long as nothing was seen it leaves vectors as they are
+    >>> norm = RunningNorm(2)  # as long as nothing was seen it clips vectors and leaves them as they are
     >>> norm.observe(torch.tensor([[0.0, 30.0], [2.0, 50.0]]))
     >>> [round(value, 3) for value in norm(torch.tensor([1.0, 60.0])).tolist()]
     [0.0, 2.0]

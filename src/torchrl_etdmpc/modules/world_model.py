@@ -173,7 +173,7 @@ class WorldModel(nn.Module):
         )
         self.register_buffer("bins", torch.linspace(bin_min, bin_max, num_bins))
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
-        """How many gradient updates made these weights; stamped on every planner target."""
+        """How many gradient updates made these weights, skipped ones included; stamped on every planner target."""
 
     def train(self, mode: bool = True) -> WorldModel:
         """Sets the mode of all networks; what an encoder of yours has frozen (dropout, batch statistics) stays so."""

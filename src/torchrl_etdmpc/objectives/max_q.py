@@ -106,6 +106,7 @@ def _max_q(
     # Departure from TD-MPC2, which trains the policy on the last latent of the rollout too, with a weight of rho^T: a
     # term has one error for every step.
     latent = head_rows(rollout.predicted[:-1])
+    # Departure from the thesis, which takes the mean of all heads: of two, drawn anew each time, as in TD-MPC2's code.
     value, entropy = policy_value(
         world_model,
         latent,

@@ -60,6 +60,7 @@ def distillation(
     mean, log_std = world_model.policy(latent.detach())
     policy = (mean, log_std.exp())
     plan = (plan_loc, plan_scale)
+    # Departure from section 3.2 of the thesis, which has KL(plan || policy): its Eq. 2.17 and BMPC have the other one.
     kl = gaussian_kl(*policy, *plan) if kl_direction == "backward" else gaussian_kl(*plan, *policy)
     # Departure from BMPC and TD-MPC2, which take minus the log-probability of a sample for the entropy: the closed form
     # has the same gradient and no noise.

@@ -169,7 +169,7 @@ def _rewards_along(world_model: PredictionModel, latent: Tensor, latents: list[T
 
 def _survival(world_model: PredictionModel, latents: list[Tensor]) -> Tensor | None:
     """Probability ``[B, N, H, F]`` of being alive at each latent ``[F, B, N, L]``; ``None``: nothing terminates."""
-    # Departure from the thesis and TD-MPC2, which cut a rollout where the probability passes a threshold: as a weight,
+    # Departure from TD-MPC2, whose episodic mode cuts a rollout where the probability passes a threshold: as a weight,
     # a calibrated probability counts for what it is.
     predicted = [world_model.termination(latent) for latent in latents]
     ended = [probability for probability in predicted if probability is not None]

@@ -41,7 +41,8 @@ def console() -> Iterator[None]:
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         if record.levelno >= logging.WARNING or Path(record.pathname).resolve().is_relative_to(_PACKAGE):
-            _write(self.format(record), sys.stdout)
+            with contextlib.suppress(OSError, ValueError):  # a full disk or a closed pipe does not end what it tells of
+                _write(self.format(record), sys.stdout)
 
 
 def _format_warning(message: Any, category: Any, filename: str, lineno: int, line: Any = None) -> str:

@@ -96,12 +96,12 @@ class RunDirectory:
         try:
             import fcntl
 
-            file = open(self.lock, "rb+")
+            file = open(self.lock, "rb")
         except (ImportError, OSError):
             return False
         with file:
             try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.lockf(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # which reading is enough for
             except (BlockingIOError, PermissionError):
                 return True
             except OSError:  # a file system without locks

@@ -38,6 +38,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield partial
         sync(partial)
         os.replace(partial, path)
+        sync(path.parent)
     finally:
         partial.unlink(missing_ok=True)
 

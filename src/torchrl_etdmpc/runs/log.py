@@ -130,9 +130,12 @@ class RunLog:
 
     def close(self) -> None:
         """Closes the logger; the files need no closing."""
-        if self.logger is not None:
-            self.logger.shutdown()
-            self.logger = None
+        logger, self.logger = self.logger, None
+        if logger is not None:
+            try:
+                logger.shutdown()
+            except OSError as error:
+                self._warn_of_logger(logger, error)
 
     def state_dict(self) -> dict[str, Any]:
         """What the files hold: a run that goes on from here forgets what was written later, and what was damaged."""
@@ -182,7 +185,17 @@ class RunLog:
             )
         if self.logger is not None:
             shown = {f"{table}/{name}": value for name, value in row.items() if name != "env_steps"}
-            self.logger.log_metrics(shown, step=int(row["env_steps"]))
+            try:
+                self.logger.log_metrics(shown, step=int(row["env_steps"]))
+            except OSError as error:
+                self._warn_of_logger(self.logger, error)
+
+    def _warn_of_logger(self, logger: Logger, error: OSError) -> None:
+        warnings.warn(
+            f"{type(logger).__name__} failed ({error.strerror or error}) and misses rows, which are in "
+            f"{self.directory}/*.csv.",
+            stacklevel=5,
+        )
 
     def _write(self, table: Table) -> None:
         file, content, written = self._files[table], self._content[table], self._written[table]

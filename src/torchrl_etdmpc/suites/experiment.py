@@ -405,9 +405,12 @@ def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str
     variants: dict[str, dict[str, Any]] = {}
     searches: dict[str, Search] = {}
     for name, settings in (given or {}).items():
+        _require(
+            isinstance(name, str), f"variants of {file} must have texts for names, got {name!r}; put it in quotes."
+        )
         what = f"variant {name} of {file}"
         if not (isinstance(settings, dict) and "search" in settings):
-            variants[str(name)] = _replaced(_settings(settings, what), more)
+            variants[name] = _replaced(_settings(settings, what), more)
             continue
         _require(isinstance(settings["search"], dict), f"{what} must search settings by name.")
         fixed = dict(settings)
@@ -416,7 +419,7 @@ def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str
         both = sorted(set(map(str, space)) & set(shared))
         _require(not both, f"{what} searches {', '.join(both)}, which is given as well.")
         try:
-            searches[str(name)] = Search(dict(space), trials, shared, prune)
+            searches[name] = Search(dict(space), trials, shared, prune)
         except ValueError as error:
             raise ValueError(f"{what}: {error}") from error
     return variants, searches

@@ -16,7 +16,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
-from torchrl_etdmpc.keys import NEXT, PLAN, VERSION, WORKER
+from torchrl_etdmpc.keys import NEXT, PLAN, VALUE, VERSION, WORKER
 from torchrl_etdmpc.runs import first_line
 from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig
@@ -90,7 +90,7 @@ class WorkerCollector:
     - exactness: which rows arrive when differs from run to run, and a run that goes on begins fresh episodes.
 
     Where a worker fails, all are started anew, with other numbers and fresh episodes, and the failure counts as one of
-    the simulator. A worker that fails before it has sent a batch is an error: it would do so again.
+    the simulator. A worker that fails before any has sent a batch is an error: it would do so again.
 
     Args:
         config (DistributedConfig): the run.
@@ -186,7 +186,7 @@ class WorkerCollector:
         parts = WorkerParts(config, sizes, agent.planner.discount, compiled)
         self._numbers = range(self._next_number, self._next_number + config.workers)
         self._next_number += config.workers
-        self._arrived, self._last_worker = False, None
+        self._last_worker = None
         torchrl_logger.info(f"starting {config.workers} workers")
         self._workers = start_workers(parts, engine=config.engine, numbers=self._numbers, rows=config.rows_per_batch)
         self._planning = not self.in_seed_phase
@@ -209,16 +209,18 @@ class WorkerCollector:
 
     def _failed(self, error: BaseException) -> Exception:
         """The error to raise: of the simulator if new workers may do better."""
-        if self._workers is None:  # they did not start
-            return RuntimeError(f"the workers cannot be started: {first_line(error)}")
-        text = why_it_failed(self._workers, error)
-        self._stop()
+        if self._workers is None:
+            text = f"the workers cannot be started: {first_line(error)}"
+        else:
+            text = why_it_failed(self._workers, error)
+            self._stop()
         if not self._arrived:
             return RuntimeError(f"{text}, before it sent a row")
         return SimulatorError(f"{text}; all workers are started anew")
 
     def _check_finite(self, rows: TensorDictBase) -> None:
-        for key, value in rows.exclude(*self.exclude_keys).items(True, True):
+        # A plan that fell back has no value.
+        for key, value in rows.exclude((PLAN, VALUE), *self.exclude_keys).items(True, True):
             if value.is_floating_point() and not value.isfinite().all():
                 number = int(rows[WORKER][0]) - self._numbers.start
                 self._stop()

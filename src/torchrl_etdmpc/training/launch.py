@@ -160,11 +160,12 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
 
 def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
     config, directory = plan.config, plan.directory
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
-    torch.set_float32_matmul_precision("high")
-    torch.manual_seed(config.seed)
     with contextlib.ExitStack() as stack:
+        if config.threads is not None:
+            stack.callback(torch.set_num_threads, torch.get_num_threads())  # a sweep's next run may leave them open
+            torch.set_num_threads(config.threads)
+        torch.set_float32_matmul_precision("high")
+        torch.manual_seed(config.seed)
         env = make_env(config.task_spec, seed=config.seed, num_envs=config.num_envs)
         stack.callback(env.close, raise_if_closed=False)
         eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)

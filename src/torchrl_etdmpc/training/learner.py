@@ -130,6 +130,7 @@ class Learner:
 
     def updates(self, decisions: int) -> None:
         """The updates that so many decisions call for."""
+        # Departure from the thesis, whose table counts updates per env step: per decision, as BMPC counts them.
         for _ in range(self.config.optim.updates_per_decision * decisions):
             self.update()
 

@@ -6,14 +6,38 @@ import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import torch
 from torchrl import torchrl_logger
+from torchrl.checkpoint import GlobalRNGState
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore, DamagedBufferError, Part
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.training.agent_file import BestAgent, read_agent_file
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.learner import Learner
+
+
+class RandomState(GlobalRNGState):
+    """The generators of Python, NumPy and PyTorch; a run may go on where there are fewer GPUs, or none.
+
+    >>> state = RandomState().state_dict()
+    >>> RandomState().load_state_dict(state | {"torch_cuda": []})
+    """
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores the generators of what is here, and warns of a GPU's that is not."""
+        states = dict(state_dict)
+        saved = states.pop("torch_cuda", [])
+        here = saved[: torch.cuda.device_count()] if torch.cuda.is_available() else []
+        if len(here) < len(saved):
+            warnings.warn(
+                f"the run was saved on a machine with {len(saved)} GPUs, here are {len(here)}: it goes on with other "
+                "random numbers.",
+                stacklevel=2,
+            )
+        super().load_state_dict(states | ({"torch_cuda": here} if here else {}))
 
 
 class RunCheckpoints:

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torchrl import torchrl_logger
-from torchrl.checkpoint import GlobalRNGState
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.checkpoints import Part
@@ -22,7 +21,7 @@ from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.evaluator import Evaluator
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.precompile import precompile
-from torchrl_etdmpc.training.run_checkpoints import RunCheckpoints
+from torchrl_etdmpc.training.run_checkpoints import RandomState, RunCheckpoints
 from torchrl_etdmpc.training.run_state import Duty, RunState
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 
@@ -90,7 +89,7 @@ class TrainingRun:
             "learner": self.learner,
             "log": log,
             "state": self.state,
-            "random": GlobalRNGState(),  # last: restoring the others may draw from it
+            "random": RandomState(),  # last: restoring the others may draw from it
         }
         self.checkpoints = RunCheckpoints(config, log.directory, self.learner, self.best, self.parts)
         self._compile_s = 0.0

@@ -133,7 +133,7 @@ class Updater:
 
     @property
     def updates(self) -> int:
-        """Gradient steps so far."""
+        """Gradient steps so far, skipped ones included."""
         return int(self.loss.world_model.version)
 
     def step(self, batch: TensorDictBase, *, distill: bool = True) -> TensorDictBase:

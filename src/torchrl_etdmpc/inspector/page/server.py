@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import threading
 from collections.abc import Callable
@@ -51,8 +52,11 @@ def serve(
             listening.bind((host, port))
             listening.listen()
         except OSError as error:
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise OSError(f"host={host} is no address of this machine ({error.strerror}).") from error
+            other = port + 1 if port < 65_535 else 8_050
             raise OSError(
-                f"port={port} cannot be used ({error.strerror}); choose another one, e.g. port={port + 1}."
+                f"port={port} cannot be used ({error.strerror}); choose another one, e.g. port={other}."
             ) from error
         number = listening.getsockname()[1]
         server = make_server(host, number, app.server, threaded=True, request_handler=Quiet, fd=listening.fileno())
