@@ -110,16 +110,14 @@ def start(*arguments: str) -> subprocess.Popen[str]:
         signal.signal(signal.SIGINT, handler)
 
 
-def test_one_command_in_an_empty_folder_compares_runs_with_the_published_baselines(tmp_path):
+def test_one_command_in_an_empty_folder_compares_runs_with_the_published_baselines(run_script):
     for seed in (1, 2):
         make_run(
             f"runs/{seed}", seed=seed, text=HEADER + ROWS.format(seed=seed) + f"200000,100000,7,1.0,{seed}00,0,1\n"
         )
-    process = start("runs")
-    assert process.wait(timeout=600) == 0, Path("stderr").read_text()
-    assert Path("stderr").read_text() == ""
+    process = run_script("report.py", "runs", cwd=Path.cwd())
     closing = "2 runs on 1 task of Easy DMC, up to 200,000 env steps; the report is report/index.md\n"
-    assert Path("stdout").read_text() == closing
+    assert (process.returncode, process.stdout, process.stderr) == (0, closing, "")
     assert {path.name for path in Path("report").iterdir()} == FILES
     row = read_table(Path("report", "final.csv"))["walker-walk"]
     assert float(row["cpu"]) == 150
@@ -128,11 +126,10 @@ def test_one_command_in_an_empty_folder_compares_runs_with_the_published_baselin
     assert float(read_table(Path("report", "final.csv"))["Normalized aggregate"]["BMPC"]) == 1
 
 
-def test_a_path_that_does_not_exist_is_one_line_on_stderr_of_the_real_command(tmp_path):
-    process = start("nowhere", "--out", "made")
-    assert process.wait(timeout=600) == 1
-    assert Path("stderr").read_text() == "error: no such run directory: nowhere.\n"
-    assert Path("stdout").read_text() == ""
+def test_a_path_that_does_not_exist_is_one_line_on_stderr_of_the_real_command(run_script):
+    process = run_script("report.py", "nowhere", "--out", "made", cwd=Path.cwd())
+    told = "error: no such run directory: nowhere.\n"
+    assert (process.returncode, process.stdout, process.stderr) == (1, "", told)
     assert not Path("made").exists()
 
 
