@@ -4,7 +4,7 @@ PYTHON ?= python3
 TASK ?= walker-stand
 RUN_DIR ?= runs/$(TASK)
 JOBS ?= 3
-# Two threads are a quarter to two fifths faster than one where two cores are idle (docs/results.md).
+# Two threads make a compiled run a quarter to two fifths faster where two cores are idle (docs/results.md).
 THREADS ?= $(shell $(PYTHON) -c "import os; print(min(2, os.cpu_count() or 1))")
 ARGS ?=
 PORT ?= 8000

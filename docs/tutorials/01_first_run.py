@@ -2,15 +2,15 @@
 First run and its curves
 ========================
 
-A run is a configuration and a folder. This page trains Gymnasium's Pendulum for a few minutes of its time and reads
-what the run wrote.
+A run is a configuration and a folder. This page trains Gymnasium's Pendulum for 1,200 steps, a minute of its time,
+and reads what the run wrote.
 """
 
 # %%
 # The configuration
 # -----------------
-# A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` is the full method at a size that
-# one core learns with. On the command line the same is ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu
+# A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` has the parts of the
+# method at a size that one core learns with, and some settings of its own. On the command line the same is ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu
 # total_env_steps=1200 ...``.
 
 import tempfile

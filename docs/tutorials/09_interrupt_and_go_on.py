@@ -89,7 +89,7 @@ print(launch(config("stopped", resume="auto")).rpartition(";")[0])
 runs = {name: pd.read_csv(folder / name / "eval.csv") for name in ("left alone", "stopped")}
 same = runs["left alone"]["return_mean"].equals(runs["stopped"]["return_mean"])
 agents = [torch.load(folder / name / "checkpoints" / "last.pt", weights_only=True) for name in runs]
-weights = [agent["agent"]["world_model"] if "agent" in agent else agent["world_model"] for agent in agents]
+weights = [agent["world_model"] for agent in agents]
 equal = all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
 print(f"evaluations equal to the last digit: {same}")
 print(f"final weights equal to the last bit: {equal}")

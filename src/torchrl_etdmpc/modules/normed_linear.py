@@ -195,7 +195,23 @@ class LayerStack(nn.Module):
 
 
 class MLP(LayerStack):
-    """A ``LayerStack`` from one tensor to one tensor.
+    """Hidden :class:`NormedLinear` layers and one output layer, from one tensor to one tensor.
+
+    Args:
+        in_features (int): input size.
+        hidden_sizes (sequence of int): sizes of the hidden layers.
+        out_features (int): output size.
+
+    Keyword Args:
+        activation (str): ``"mish"``, ``"silu"`` or ``"relu"`` for the hidden layers. Default: ``"mish"``.
+        output_activation (callable, optional): if given, the output layer is a :class:`NormedLinear` with it. Default:
+            ``None``, it is linear.
+        num_members (int, optional): E, of a stack of networks. Default: ``None``, one network.
+        dropout (float): of the first hidden layer, in [0, 1). Default: 0.
+        zero_init_output (bool): whether a linear output layer starts at zero. Default: ``False``.
+
+    Raises:
+        ValueError: if the activation is unknown or the dropout out of range.
 
     >>> MLP(3, [16], 2, num_members=4)(torch.zeros(4, 7, 3)).shape
     torch.Size([4, 7, 2])

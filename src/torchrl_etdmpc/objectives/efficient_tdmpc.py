@@ -18,6 +18,10 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
     computed on one latent rollout. The policy term sends no gradient into the world model and the other terms send none
     into the policy, so one backward pass serves both optimisers.
 
+    Reads slices ``[B, T]`` with ``observation``, ``action``, ``("next", "observation")``, ``("next", "reward")``,
+    ``("next", "terminated")``, ``("plan", "loc")`` and ``("plan", "scale")`` (:mod:`torchrl_etdmpc.keys`). Returns
+    weighted ``loss_*``, to be summed, and detached metrics.
+
     Use :class:`torchrl.objectives.SoftUpdate` (``tau=0.01``) on this loss for the target value heads.
 
     Args:
@@ -25,9 +29,9 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
 
     Keyword Args:
         discount (float): gamma, in (0, 1].
-        consistency_coef (float): Default: 20.
-        reward_coef (float): Default: 0.1.
-        value_coef (float): Default: 0.1.
+        consistency_coef (float): weight of predicting the next latent, not negative. Default: 20.
+        reward_coef (float): weight of predicting the reward, not negative. Default: 0.1.
+        value_coef (float): weight of the value targets, not negative. Default: 0.1.
         value_beta (float): pessimism of the value targets, the weight of the ensemble's standard deviation, not
             negative. Default: 0, the mean.
         value_replayed (float): weight in the value targets of what was paid in the rest of the slice
@@ -36,8 +40,8 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         value_expectile (float): of the value targets, which the values learn, in (0, 1): above 0.5 what is above a
             value counts more (:func:`~torchrl_etdmpc.objectives.value_error`). Not in the thesis. Default: 0.5.
         termination_coef (float): used with a termination head. Default: 1.
-        policy_coef (float): Default: 1.
-        entropy_coef (float): Default: 1e-4.
+        policy_coef (float): weight of the distillation, not negative. Default: 1.
+        entropy_coef (float): weight of the policy's entropy, not negative. Default: 1e-4.
         scale_tau (float): rate of the running scale of the KL. Default: 0.01.
         kl_direction (str): ``"backward"`` (default, KL(pi || plan)) or ``"forward"``.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
