@@ -34,7 +34,7 @@ from dm_control import suite
 from matplotlib.figure import Figure
 from tensordict.nn import TensorDictModule
 
-from torchrl_etdmpc.analysis import Run, add_interval, estimate, find_runs, join_runs, method_styles
+from torchrl_etdmpc.analysis import Run, add_interval, estimate, find_runs, join_runs
 from torchrl_etdmpc.analysis.curves import read_evaluations
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import get_task, make_env
@@ -143,14 +143,21 @@ def train(task: str, algorithm: str, settings: str, seed: int, target: Path, env
     return f"{task}, {method}, seed {seed}: return {final:.0f} in {(time.perf_counter() - began) / 60:.0f} min"
 
 
+def _style(method: str) -> dict[str, str]:
+    """A colour and a marker for each algorithm, a dash for its settings."""
+    color, marker = {"SAC": ("#D55E00", "s"), "TQC": ("#009E73", "^")}.get(method.partition(" ")[0], ("#0072B2", "o"))
+    return {"color": color, "marker": marker, "linestyle": "--" if "(zoo)" in method else "-"}
+
+
 def report(ours: list[Path]) -> str:
     """Figure and table of every method over env steps and over minutes."""
     runs = [run for run in map(Run.read, find_runs([FOLDER, *ours])) if run.task in TASKS and run.finished]
     curves = join_runs(runs)
     methods = [*sorted(set(curves["method"]) - {"cpu"}), "cpu"]
-    styles = method_styles(methods)
+    styles = {method: _style(method) for method in methods}
     clocks = [read_evaluations(run.path).assign(task=run.task, method=run.method) for run in runs]
-    minutes = pd.concat(clocks).groupby(["task", "method", "env_steps"])["wall_time_s"].mean().div(60).rename("minutes")
+    clock = pd.concat(clocks).assign(minutes=lambda rows: rows["wall_time_s"] / 60)
+    minutes = clock.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
     found = add_interval(estimate(curves)).join(minutes, on=["task", "method", "env_steps"])
     tasks = [task for task in TASKS if task in set(found["task"])]
     figure = Figure(figsize=(3.1 * len(tasks), 5.2), layout="constrained")
@@ -160,9 +167,10 @@ def report(ours: list[Path]) -> str:
             axis = axes[row, column]
             for method in methods:
                 line = found[(found["task"] == task) & (found["method"] == method) & (found["env_steps"] > 0)]
-                axis.plot(line[x], line["mean"], label=method, linewidth=1.6, **styles[method])
-                axis.fill_between(line[x], line["lower"], line["upper"], color=styles[method]["color"], alpha=0.15)
-            axis.set(title=task if row == 0 else None, xlabel=("env steps", "minutes on one core")[row])
+                places = line[x] / 1000 if row == 0 else line[x]
+                axis.plot(places, line["mean"], label=method, linewidth=1.6, markersize=4, **styles[method])
+                axis.fill_between(places, line["lower"], line["upper"], color=styles[method]["color"], alpha=0.15)
+            axis.set(title=task if row == 0 else None, xlabel=("thousand env steps", "minutes on one core")[row])
             axis.grid(alpha=0.3)
     for axis in axes[:, 0]:
         axis.set_ylabel("episode return")

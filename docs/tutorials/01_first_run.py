@@ -9,9 +9,9 @@ and reads what the run wrote.
 # %%
 # The configuration
 # -----------------
-# A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` has the parts of the
-# method at a size that one core learns with, and some settings of its own. On the command line the same is ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu
-# total_env_steps=1200 ...``.
+# A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` has the parts of the method at a
+# size that one core learns with, and some settings of its own. On the command line the same is
+# ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu total_env_steps=1200 ...``.
 
 import tempfile
 from dataclasses import replace

@@ -34,6 +34,9 @@ def result_table(values: pd.DataFrame, *, tasks: Sequence[str], methods: Sequenc
 def rank_methods(table: pd.DataFrame) -> pd.DataFrame:
     """The best and the second best method of every row; missing where there is none. Ties go to the first column.
 
+    Args:
+        table (DataFrame): index ``task``, a column of numbers for each method, the larger the better.
+
     Returns:
         DataFrame: index ``task``, columns ``best, second_best``.
 

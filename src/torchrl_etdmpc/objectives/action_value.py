@@ -101,7 +101,16 @@ def action_value_error(
 def action_td_error(
     world_model: ActionValueWorldModel, rollout: LatentRollout, slices: Slices, target: Tensor
 ) -> Tensor:
-    """Distance of the action values from their targets, ``mean_{i,j} |Q_j(zhat_{k,i}, a_k) - y_k|``, ``[T, B]``.
+    """Distance of the action values from their targets, ``mean_{i,j} |Q_j(zhat_{k,i}, a_k) - y_k|``.
+
+    Args:
+        world_model (ActionValueWorldModel): the networks, N_Q heads.
+        rollout (LatentRollout): of these slices, F dynamics heads.
+        slices (Slices): B slices of T steps.
+        target (Tensor): y, shape ``[T, B]``.
+
+    Returns:
+        Tensor: not negative, shape ``[T, B]``.
 
     >>> from torchrl_etdmpc.objectives import TDMPC2Loss
     >>> from torchrl_etdmpc.objectives.latent_rollout import latent_rollout

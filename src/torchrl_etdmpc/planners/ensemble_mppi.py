@@ -330,9 +330,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             generator (torch.Generator, optional): of the plan's random numbers. Default: PyTorch's global one.
 
         Returns:
-            TensorDictBase: with ``action [..., A]``; ``("plan", "loc")`` and ``("plan", "scale")`` ``[..., A]``, what the
-            policy learns; ``("plan", "value")``, ``("plan", "version")`` (int64) and ``("plan", "fallback")`` (bool)
-            ``[..., 1]``; with a warm start ``("next", "plan_mean") [..., H, A]``.
+            TensorDictBase: with ``action [..., A]``; ``("plan", "loc")`` and ``("plan", "scale")`` ``[..., A]``, which
+            the policy learns; ``("plan", "value")``, ``("plan", "version")`` (int64) and ``("plan", "fallback")``
+            (bool) ``[..., 1]``; with a warm start ``("next", "plan_mean") [..., H, A]``.
 
         Raises:
             KeyError: if neither an observation nor a latent is present.

@@ -40,7 +40,8 @@ class StepSliceSampler(Sampler):
     of a sample depends on the number of trajectories in the buffer (two thousand for a million DMC steps) and not on
     the number of rows.
 
-    It draws as ``uniform_over`` says and takes no priorities; for those use TorchRL's ``PrioritizedSliceSampler`` in its place.
+    It draws as ``uniform_over`` says and takes no priorities; for those use TorchRL's ``PrioritizedSliceSampler`` in
+    its place.
 
     Args:
         slice_len (int): T, transitions per slice.

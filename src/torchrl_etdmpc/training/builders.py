@@ -42,6 +42,10 @@ def resolve_device(name: str) -> torch.device:
 def row_bytes(observation_dim: int, action_dim: int) -> int:
     """Bytes of one stored transition: observation before and after, action, reward, planner's target and labels.
 
+    Args:
+        observation_dim (int): O.
+        action_dim (int): A.
+
     >>> row_bytes(24, 6)  # walker's
     311
     """

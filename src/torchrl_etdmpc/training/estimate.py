@@ -33,6 +33,9 @@ def decision_flops(config: TrainConfig) -> tuple[float, float]:
 def estimated_seconds(config: TrainConfig) -> float:
     """Seconds of the whole run on the CPU, without compilation; right within a factor of two or three.
 
+    Args:
+        config (TrainConfig): its task and preset, sizes, budgets and threads count.
+
     >>> from torchrl_etdmpc.training import preset
     >>> 10 < estimated_seconds(preset("cpu")) < 100_000
     True
