@@ -19,7 +19,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
     into the policy, so one backward pass serves both optimisers.
 
     Reads slices ``[B, T]`` with ``observation``, ``action``, ``("next", "observation")``, ``("next", "reward")``,
-    ``("next", "terminated")``, ``("plan", "loc")`` and ``("plan", "scale")`` (:mod:`torchrl_etdmpc.keys`). Returns
+    ``("next", "terminated")``, ``("plan", "loc")`` and ``("plan", "scale")`` (``torchrl_etdmpc.keys``). Returns
     weighted ``loss_*``, to be summed, and detached metrics.
 
     Use :class:`torchrl.objectives.SoftUpdate` (``tau=0.01``) on this loss for the target value heads.
