@@ -3,7 +3,7 @@
     pip install --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
     python benchmarks/race.py                                # all runs that are missing, one after the other (a day)
     python benchmarks/race.py --tasks walker-walk --algorithms tqc --settings zoo --seeds 1
-    python benchmarks/race.py --report-only RUN_DIRECTORY... # figure and table, beside runs of ours
+    python benchmarks/race.py --report-only RUN_DIRECTORY... # figure and table, beside finished runs of ours
 
 The same physics, action repeat, evaluation (mean of 10 episodes without noise on starts that the run's seed gives) and
 one thread. Two settings each, because a library is worth what its better one reaches: `default` is
@@ -185,6 +185,8 @@ def report(ours: list[Path]) -> str:
         cells = [f"{early['mean']:.0f}", f"{early['minutes']:.1f}", f"{last['mean']:.0f}", f"{last['minutes']:.1f}"]
         seeds = curves[(curves["task"] == task) & (curves["method"] == method)]["seed"].nunique()
         lines.append(f"| {task} | {method} | {seeds} | " + " | ".join(cells) + " |")
+    beside = [os.path.relpath(run.path, RESULTS) for run in runs if not run.path.is_relative_to(FOLDER)]
+    lines += ["", f"Runs of ours, below `benchmarks/results/cpu`: {', '.join(beside)}."]
     versions = {json.dumps(json.loads(path.read_text())["versions"]) for path in FOLDER.rglob("summary.json")}
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
     return "\n".join([*lines, "", "![race](race.png)", ""])
