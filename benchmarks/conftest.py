@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -121,11 +122,19 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     rows = [row for row in old if (row["case"], row["variant"]) not in done] + [row | about for row in rows]
     RESULTS.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(rows, indent=1) + "\n")
-    versions = ", ".join(f"{name} {number}" for name, number in about["versions"].items())
+    write_speed_table(rows)
+    write_plan_table()
+
+
+def write_speed_table(rows: list[dict[str, Any]]) -> None:
+    """Every row that was measured, in ``speed.md``."""
+    machines = {
+        f"{row['device']}; {', '.join(f'{name} {number}' for name, number in row['versions'].items())}" for row in rows
+    }
     lines = [
         "# Speed",
         "",
-        f"Made by `make bench` on {about['device']}; {versions}.",
+        f"Made by `make bench` on {'. Some rows on '.join(sorted(machines))}.",
         "Medians; `of limit` is the share of the speed of large matrix products just before and after. The ratio is",
         "the baseline's time over this one, both of one process.",
         "",
@@ -133,13 +142,17 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in sorted(rows, key=lambda row: row["case"]):
-        cells = [row["case"], row["variant"], row["threads"], f"{row['median_ms']:.3g}"]
-        cells += ["" if row["gflop"] is None else f"{row['gflop']:.3g}"]
+        cells = [row["case"], row["variant"], row["threads"], three_digits(row["median_ms"])]
+        cells += ["" if row["gflop"] is None else three_digits(row["gflop"])]
         cells += ["" if row["of_limit"] is None else f"{row['of_limit']:.2f}", row["baseline"]]
         cells += ["" if row["ratio"] is None else f"{row['ratio']:.2f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     (RESULTS / "speed.md").write_text("\n".join(lines) + "\n")
-    write_plan_table()
+
+
+def three_digits(number: float) -> str:
+    """Three significant digits, without an exponent: 0.0123, 4.67, 4,670."""
+    return f"{float(f'{number:.3g}'):,.10g}"
 
 
 def write_plan_table() -> None:
@@ -151,7 +164,7 @@ def write_plan_table() -> None:
         for row in json.loads(file.read_text()):
             if match := pattern.fullmatch(row["case"]):
                 sizes = [int(number) for number in match.groups()]
-                milliseconds = [f"{row['median_ms']:.3g}", f"{row['median_ms'] / sizes[0]:.3g}"]
+                milliseconds = [three_digits(row["median_ms"]), three_digits(row["median_ms"] / sizes[0])]
                 cells = [
                     row["device"],
                     row["variant"],
