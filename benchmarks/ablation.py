@@ -1,6 +1,6 @@
 """Does the method help at the cpu preset's size? The experiment `cpu-ablation`, what is kept of its runs, its figure.
 
-    python benchmarks/ablation.py                          # 8 variants, 5 tasks, 5 seeds, 50,000 env steps: two days
+    python benchmarks/ablation.py                          # 10 variants, 5 tasks, 5 seeds, 50,000 env steps: days
     python benchmarks/ablation.py --variants "all four off (BMPC)" --tasks walker-run hopper-stand --seeds 1
     python benchmarks/ablation.py --report-only            # from the committed files
 
@@ -16,6 +16,7 @@ import argparse
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from cpu_learning import RESULTS, ROOT, TASKS
 from matplotlib.figure import Figure
 from scipy.stats import t as student
 
-from torchrl_etdmpc.analysis import method_styles, read_runs
+from torchrl_etdmpc.analysis import read_runs
 from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.suites import read_experiment
@@ -131,23 +132,25 @@ def report(pairs: pd.DataFrame) -> str:
 
 
 def draw(pairs: pd.DataFrame) -> Figure:
-    """A panel for each variant: the difference on every task, and their mean with its interval."""
-    variants = list(pairs.index.unique("variant"))
-    styles = method_styles(variants)
-    figure = Figure(figsize=(5.4 * len(variants), 0.24 * pairs.index.unique("task").size + 1.4), layout="constrained")
-    for axis, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
+    """A panel for each variant: the difference on every task, and where there are several their mean."""
+    variants, tasks = list(pairs.index.unique("variant")), sorted(pairs.index.unique("task"), reverse=True)
+    figure = Figure(figsize=(1.6 + 2.6 * len(variants), 0.26 * len(tasks) + 1.5), layout="constrained")
+    axes = figure.subplots(1, len(variants), squeeze=False, sharex=True, sharey=True)[0]
+    for axis, variant in zip(axes, variants, strict=True):
         by_task = pairs.loc[variant].groupby("task").mean()
-        found = (by_task[f"variant {ENV_STEPS}"] - by_task[f"base {ENV_STEPS}"]).sort_values()
+        found = by_task[f"variant {ENV_STEPS}"] - by_task[f"base {ENV_STEPS}"]
+        for task, difference in found.items():
+            place = 1 + tasks.index(str(task))
+            axis.plot(difference, place, "o", color="#0072B2", fillstyle="none" if task in TASKS else "full")
         mean, half = mean_over_tasks(found)
-        color = styles[variant]["color"]
-        for place, (task, difference) in enumerate(found.items(), start=1):
-            axis.plot(difference, place, "o", color=color, fillstyle="none" if task in TASKS else "full")
-        axis.errorbar(mean, 0, xerr=None if np.isnan(half) else half, fmt="D", color="black", capsize=3)
+        if not np.isnan(half):
+            axis.errorbar(mean, 0, xerr=half, fmt="D", color="black", capsize=3)
         axis.axvline(0, color="grey", linewidth=0.8)
-        names = [f"{task} (tuned on)" if task in TASKS else str(task) for task in found.index]
-        axis.set_yticks(range(len(names) + 1), ["mean, 95% interval", *names])
-        axis.set(title=variant, xlabel=f"return minus the preset's at {ENV_STEPS:,} env steps")
+        axis.set_title(textwrap.fill(variant, 26), fontsize=10)
         axis.grid(axis="x", alpha=0.3)
+    names = [f"{task} (tuned on)" if task in TASKS else task for task in tasks]
+    axes[0].set_yticks(range(len(tasks) + 1), ["mean, 95% interval", *names])
+    figure.supxlabel(f"return minus the preset's at {ENV_STEPS:,} env steps", fontsize=10)
     return figure
 
 
