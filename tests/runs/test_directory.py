@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -234,6 +235,20 @@ def test_a_process_that_was_killed_keeps_nobody_out(tmp_path, in_copy):
     directory.go_on()
     directory.close()
     assert [path.name for path in directory.path.iterdir()] == ["config.yaml"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="becomes another user")
+def test_another_user_sees_that_a_run_is_alive(in_copy):
+    def look() -> None:
+        os.setuid(65_534)
+        assert RunDirectory(directory.path).in_use
+
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own are closed to others
+        os.chmod(folder, 0o755)
+        directory = RunDirectory(Path(folder) / "run")
+        directory.begin(CONFIG)
+        assert in_copy(look) == 0
+        directory.close()
 
 
 def test_a_directory_that_nobody_holds_on_to_is_unlocked(tmp_path, elsewhere):

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import pickle
+import stat
 import zipfile
 from itertools import count
 from pathlib import Path
@@ -56,7 +57,7 @@ def test_the_temporary_name_lies_beside_the_file_keeps_its_suffix_and_is_hidden(
     assert names(tmp_path) == {"film.mp4"}
 
 
-def test_the_content_is_on_disk_before_the_name_is(tmp_path, monkeypatch):
+def test_the_content_is_on_disk_before_the_name_is_and_then_the_name(tmp_path, monkeypatch):
     path, events = tmp_path / "notes.txt", []
     fsync, replace = os.fsync, os.replace
 
@@ -71,7 +72,26 @@ def test_the_content_is_on_disk_before_the_name_is(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(os, "replace", replaced)
     write_whole(path, NEW)
-    assert events[:2] == [("sync", path.stat().st_ino), ("replace", path.stat().st_ino)]
+    file, folder = path.stat().st_ino, tmp_path.stat().st_ino
+    assert events == [("sync", file), ("replace", file), ("sync", folder)]
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EIO])
+def test_a_file_system_that_cannot_sync_folders_does_without(tmp_path, monkeypatch, number):
+    fsync = os.fsync
+
+    def refused(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", refused)
+    if number == errno.EINVAL:
+        write_whole(tmp_path / "notes.txt", NEW)
+    else:  # a disk that fails
+        with pytest.raises(OSError, match="Input/output error"):
+            write_whole(tmp_path / "notes.txt", NEW)
+    assert names(tmp_path) == {"notes.txt"}
 
 
 WRITERS = {

@@ -48,7 +48,7 @@ _CPU_MODEL: dict[str, Any] = {
     "mlp_dim": 128,
     "encoder_dim": 128,
     # Departure from the sources, which have Mish, a learning rate of 3e-4 and a tau of 0.01: SiLU, above 1e-3 and for
-    # tdmpc2-cpu 0.03. With 3e-4 small networks lose tasks (docs/studies/stability.md).
+    # tdmpc2-cpu 0.03. What 3e-4 does at this size: docs/studies/stability.md.
     "activation": "silu",
     # Departure from the sources, whose bins are 0.2 wide or finer: of 1 in symlog space. Values follow their targets
     # faster over these, and stay apart (docs/studies/stability.md).
