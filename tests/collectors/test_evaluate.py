@@ -8,11 +8,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, ExplorationType, SerialEnv, StepCounter
+from torchrl.envs import EnvBase, ExplorationType, RenameTransform, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import exploration_type, set_exploration_type
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel
-from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.collectors import NonFiniteError, evaluate
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.testing import LineWorld
 
@@ -197,3 +197,33 @@ def test_an_environment_of_other_bounds_is_refused_before_it_is_stepped():
     with pytest.raises(ValueError, match=r"bounds of -2 and 2 instead of -1 and 1 \(append ActionScaling\(\)\)"):
         evaluate(env, planner, episodes=1)
     assert env.resets == 0
+
+
+class BrokenEnv(CountingEnv):
+    """Its third step has a value that is not finite."""
+
+    def __init__(self, key: str, value: float) -> None:
+        super().__init__(5)
+        self.broken, self.value = key, value
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        following = super()._step(tensordict)
+        if self.steps == 3:
+            following[self.broken] = torch.full_like(following[self.broken], self.value)
+        return following
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("key", ["observation", "reward"])
+def test_a_value_that_is_not_finite_is_no_return(key, value):
+    with pytest.raises(NonFiniteError, match=f"^the environment returned a non-finite '{key}' at decision step 3$"):
+        evaluate(BrokenEnv(key, value), ConstantPolicy(), episodes=1)
+
+
+def test_the_reward_may_have_another_name_and_must_be_one():
+    env = CountingEnv(3)
+    renamed = TransformedEnv(env, RenameTransform(["reward"], ["score"]))
+    assert evaluate(renamed, ConstantPolicy(), episodes=1).returns.item() == expected_return(3)
+    both = TransformedEnv(CountingEnv(3), RenameTransform(["reward"], ["score"], create_copy=True))
+    with pytest.raises(ValueError, match=r"^a return is the sum of one reward, .* has \['reward', 'score'\]"):
+        evaluate(both, ConstantPolicy(), episodes=1)

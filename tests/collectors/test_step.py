@@ -25,6 +25,7 @@ from torchrl.envs import (
     GymEnv,
     InitTracker,
     ParallelEnv,
+    RenameTransform,
     SerialEnv,
     TensorDictPrimer,
     TransformedEnv,
@@ -438,6 +439,12 @@ def test_a_seed_phase_without_a_seed_policy_is_refused():
 def test_an_unknown_insertion_is_refused():
     with pytest.raises(ValueError, match="insertion must be 'step' or 'episode', got 'batch'"):
         StepCollector(make_env(), RandomActions(), replay_buffer=make_replay(), insertion="batch")
+
+
+def test_an_environment_whose_done_has_another_name_is_refused():
+    env = TransformedEnv(LineEnv(), RenameTransform(["done"], ["over"], create_copy=False))
+    with pytest.raises(ValueError, match=r"^StepCollector needs the key 'done' of an environment, got \[.*'over'"):
+        StepCollector(env, RandomActions(), replay_buffer=make_replay())
 
 
 def test_more_than_one_batch_dimension_is_refused():

@@ -138,6 +138,42 @@ def test_a_dry_run_says_what_would_be_run_and_changes_nothing(call, mine, tmp_pa
     assert out.splitlines()[-1] == "tuned: a search of 7 trials, 2 runs each"
 
 
+@pytest.mark.parametrize(
+    ("experiment", "twins"),
+    [
+        ("utd", ("efficient-tdmpc", "efficient-tdmpc-utd2")),
+        ("main-easy", ("bmpc", "efficient-tdmpc")),
+        ("main-hard", ("bmpc", "efficient-tdmpc")),
+        ("dynamics-ensemble", None),
+        ("horizon", None),
+        ("insertion", None),
+        ("cheap-reanalyze", None),
+        ("pessimism-scope", None),
+        ("reanalyze-pessimism", None),
+    ],
+)
+def test_a_setting_of_the_command_makes_no_two_variants_one_run(call, experiment, twins):
+    message, out = call(f"experiment={experiment}", "preset=cpu", "seeds=1", "dry_run=true")
+    if twins is None:
+        assert message is None and "runs, " in out
+    else:
+        assert str(message).startswith(
+            f"error: variants '{twins[0]}' and '{twins[1]}' of experiment {experiment} have the same settings on "
+        )
+        assert "leave those out, or write variants=" in str(message)
+        message, _ = call(f"experiment={experiment}", "preset=cpu", f"variants={twins[0]}", "seeds=1", "dry_run=true")
+        assert message is None
+
+
+def test_trials_of_a_search_may_be_the_same_run(call, mine, trained, tmp_path):
+    pytest.importorskip("optuna")
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 4}
+    message, _ = call(f"experiment={mine(variants={'tuned': search}, base=None)}")
+    assert message == 0
+    message, out = call(f"experiment={mine(variants={'tuned': search | {'trials': 5}}, base=None)}")
+    assert message == 0 and "tuned trial 4/cup-catch/seed1: finished" in out
+
+
 def test_an_experiment_is_trained_told_and_grown(call, mine, trained, tmp_path):
     message, out = call(f"experiment={mine()}", "variants=b", "seeds=1", "runs_dir=here")
     assert message == 0

@@ -111,9 +111,19 @@ def test_several_environments_of_a_users_task(folder, path, parallel):
     ("name", "repeat", "length"), [("limited", 1, 30), ("repeats", 4, 200), ("repeats_by_transform", 4, 40)]
 )
 def test_what_an_environment_shows_is_read(folder, name, repeat, length):
-    task = import_task(f"more_tasks:{name}")
+    task = import_task(f"more_tasks:{name}", terminates=False)
     assert (task.action_repeat, task.episode_length) == (repeat, length)
     assert make_env(task).rollout(1000).shape == (task.decision_steps_per_episode,)
+
+
+def test_a_repeat_that_steps_on_after_an_episode_has_ended_is_refused(folder):
+    with pytest.raises(ValueError) as error:
+        import_task("more_tasks:repeats_by_transform")
+    assert str(error.value) == (
+        "task 'more_tasks:repeats_by_transform' repeats actions with FrameSkipTransform, which steps on where an "
+        "episode has ended; repeat them with frame_skip= of GymEnv or DMControlEnv, or in a step of your own, or say "
+        "that only the time limit ends its episodes: task.terminates=false."
+    )
 
 
 @pytest.mark.parametrize("name", ["unlimited", "counted"])

@@ -219,7 +219,7 @@ def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, sa
         (["checkpoint=other.pt"], "other.pt is a PyTorch file but not a checkpoint of torchrl_etdmpc."),
         (["checkpoint=GOOD", "task=walker-walk"], "GOOD was trained with observation size 5 and action size 1, the "),
         (["checkpoint=GOOD", "task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
-        (["checkpoint=GOOD", "episodes=0"], "episodes must be at least 1, got 0."),
+        (["checkpoint=GOOD", "episodes=0"], "episodes must be between 1 and 10000, got 0."),
         (["checkpoint=GOOD", "episodes=many"], "episodes must be of type int, got 'many'."),
         (["checkpoint=GOOD", "policy=best"], "policy must be one of planner, bare, got 'best'."),
         (["checkpoint=GOOD", "policy=bare", "planner.horizon=4"], "planner.horizon changes nothing with policy=bare, "),

@@ -677,3 +677,40 @@ def test_a_bar_in_a_name_makes_no_column(run_main):
 def test_a_budget_without_a_grid_is_refused(refused):
     make_run("runs/a")
     assert refused("runs", "--budget", "49999") == "--budget=49999 has no grid of equal steps; take 49998 or 50000."
+
+
+def test_runs_of_one_name_with_different_settings_are_named(run_main, capfd):
+    for seed, rate in ((1, 0.001), (2, 0.0003)):
+        run = make_run(f"runs/seed{seed}", seed=seed)
+        settings = f"threads: {seed}\noptim: {{lr: {rate}, batch_size: 64}}\nmodel: {{num_bins: {seed}}}\n"
+        (run / "config.yaml").write_text((run / "config.yaml").read_text() + settings)
+    run_main("runs")
+    line = "cpu has runs with different settings: optim.lr is 0.001 in runs/seed1 and 0.0003 in runs/seed2, and 1 more"
+    assert capfd.readouterr().err == f"{line}\n"
+    assert f"{line}." in Path("report/index.md").read_text()
+
+
+def test_runs_that_differ_in_what_no_result_depends_on_are_one_method(run_main, capfd):
+    for seed in (1, 2):
+        run = make_run(f"runs/seed{seed}", seed=seed)
+        (run / "config.yaml").write_text((run / "config.yaml").read_text() + f"threads: {seed}\ndevice: d{seed}\n")
+    run_main("runs")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_return_that_is_not_a_number_is_not_reached(run_main, capfd):
+    rows = "0,0,0,1.0,10,1,10\n50000,25000,7,1.0,{},1,10\n100000,50000,7,1.0,{},1,10\n"
+    for seed, values in ((1, (300, "nan")), (2, (500, 700)), (3, ("nan", "nan"))):
+        make_run(f"runs/seed{seed}", seed=seed, text=HEADER + rows.format(*values))
+    run_main("runs")
+    out = capfd.readouterr().out
+    assert "compared at 50,000, which all of them reach" in out
+    assert "cpu on walker-walk with seed 1: ends at 50,000 env steps, others at 100,000" in out
+    assert "cpu on walker-walk with seed 3: ends at 0 env steps" in out or "with seed 3: no evaluation after 0" in out
+    (row,) = [line for line in Path("report/final.md").read_text().splitlines() if line.startswith("| walker-walk")]
+    assert row.split(" | ")[1].strip("*") == "400.0 (2)"
+
+
+def test_a_run_of_one_env_step_makes_no_curve(refused):
+    make_run("runs/seed1", text=HEADER + "0,0,0,1.0,10,1,10\n1,1,1,1.0,10,1,10\n", task="gym/Pendulum-v1")
+    assert refused("runs") == ("the runs end at 1 env step, which makes no curve; wait for an evaluation after it.")

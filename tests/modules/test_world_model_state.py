@@ -45,6 +45,14 @@ def test_a_reset_draws_every_network_anew_and_keeps_what_starts_at_zero(build):
             assert torch.equal(parameter, before[name]), name
 
 
+def test_a_model_that_is_made_on_no_device_has_its_bins_after_a_reset(build):
+    with torch.device("meta"):
+        model = build(num_bins=21, bin_min=-5.0, bin_max=5.0)
+    model = model.to_empty(device="cpu")
+    model.reset_parameters_recursive()
+    assert torch.equal(model.bins, torch.linspace(-5.0, 5.0, 21))
+
+
 def test_models_of_equal_seed_are_equal(build):
     torch.manual_seed(3)
     first = build().state_dict()

@@ -117,13 +117,14 @@ def make_loss(make_world_model: Callable[..., WorldModel]) -> Callable[..., Loss
 
 @pytest.fixture
 def make_slices() -> Callable[..., TensorDict]:
-    """Builds random slices with random flags in every step."""
+    """Builds random slices with random flags in every step, and episodes that may be done at their last one."""
 
     def make(num_slices: int = 4, slice_len: int = 3, **dims) -> TensorDict:
         sizes = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM} | dims
         slices = random_slices(**sizes, num_slices=num_slices, slice_len=slice_len)
         for flag in ("terminated", "truncated", "done"):
             slices["next", flag] = torch.rand(num_slices, slice_len, 1) < 0.5
+        slices["next", "done"][:, :-1] = False
         return slices
 
     return make

@@ -5,6 +5,7 @@ import torch
 from tensordict import LazyStackedTensorDict, TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from torchrl.data import MultiStep
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
@@ -108,12 +109,61 @@ def test_an_entry_that_does_not_fit_is_named(make_loss, slices, key, change, mes
         make_loss("whole")(slices)
 
 
-def test_flags_of_other_kinds_count_as_flags(make_loss, world_model, slices, run_seeded, assert_same_output):
-    loss = make_loss("whole", world_model).eval()
+@pytest.mark.parametrize("kind", [torch.float32, torch.int64, torch.uint8])
+@pytest.mark.parametrize("replayed", [0.0, 0.5])
+def test_flags_of_other_kinds_count_as_flags(
+    make_loss, make_world_model, slices, run_seeded, assert_same_output, kind, replayed
+):
+    loss = make_loss("whole", make_world_model(termination=True), value_replayed=replayed).eval()
     slices["collector", "mask"] = torch.ones(slices.shape, dtype=torch.bool)
+    expected = run_seeded(loss, slices)
+    for flag in ("terminated", "done"):
+        slices["next", flag] = slices["next", flag].to(kind)
+    assert_same_output(run_seeded(loss, slices), expected)
+
+
+def test_flags_of_other_kinds_count_as_flags_of_action_values(slices, run_seeded, assert_same_output):
+    sizes = {"latent_dim": 16, "mlp_dim": 12, "encoder_dim": 10, "termination": True}
+    dims = (slices["observation"].shape[-1], slices["action"].shape[-1])
+    loss = TDMPC2Loss(ActionValueWorldModel(*dims, **sizes), discount=0.9).eval()
+    SoftUpdate(loss, tau=0.01)
     expected = run_seeded(loss, slices)
     slices["next", "terminated"] = slices["next", "terminated"].float()
     assert_same_output(run_seeded(loss, slices), expected)
+
+
+def test_steps_that_are_n_steps_in_one_are_refused(make_loss, slices):
+    loss = make_loss("whole")
+    slices["steps_to_next_obs"] = torch.ones(*slices.shape, 1, dtype=torch.int64)
+    loss(slices)
+    slices["steps_to_next_obs"][1, 0] = 3
+    with pytest.raises(ValueError, match="^'steps_to_next_obs' is not 1 everywhere: these losses learn single steps"):
+        loss(slices)
+
+
+def test_what_torchrl_s_multi_step_makes_of_an_episode_is_refused(make_loss, slices):
+    episode = slices.reshape(-1).clone()
+    episode["next", "done"][:] = False
+    batch = MultiStep(gamma=0.9, n_steps=3)(episode[None])
+    with pytest.raises(ValueError, match="leave MultiStep out"):
+        make_loss("model")(batch)
+
+
+def test_an_episode_that_ends_inside_a_slice_is_refused_unless_the_rest_is_masked(make_loss, slices, run_seeded):
+    loss = make_loss("whole").eval()
+    slices["next", "done"][:] = False
+    expected = run_seeded(loss, slices)
+    slices["next", "done"][2, 1] = True  # of three steps
+    with pytest.raises(
+        ValueError, match=r"^\('next', 'done'\) is True before the last step of a slice, so that another"
+    ):
+        loss(slices)
+    slices["collector", "mask"] = torch.ones(slices.shape, dtype=torch.bool)
+    slices["collector", "mask"][2, 2] = False
+    assert run_seeded(loss, slices)["loss_value"] != expected["loss_value"]
+    del slices["collector"]
+    slices["next", "done"][2, 1], slices["next", "done"][2, 2] = False, True  # the last step of a slice may be that
+    assert run_seeded(loss, slices)["loss_value"] == expected["loss_value"]
 
 
 def test_a_plan_without_a_scale_in_one_dimension_is_no_plan(make_loss, world_model, slices, run_seeded):

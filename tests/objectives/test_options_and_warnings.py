@@ -119,3 +119,51 @@ def test_an_option_out_of_range_is_refused_by_name(make_loss, kinds, option, val
 def test_the_ends_of_the_ranges_are_accepted(make_loss, slices, total):
     for options in ({"rho": 1.0, "discount": 1.0, "scale_tau": 0.0}, {"scale_tau": 1.0}):
         assert total(make_loss("whole", **options)(slices)).isfinite()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "changed"),
+    [
+        ("value_beta", 3.0, "value_target"),
+        ("value_replayed", 1.0, "value_target"),
+        ("value_expectile", 0.9, "loss_value"),
+        ("discount", 0.5, "value_target"),
+        ("rho", 0.9, "loss_reward"),
+        ("entropy_coef", 1.0, "loss_policy"),
+    ],
+)
+def test_an_option_that_is_assigned_later_is_that_of_a_loss_that_was_built_with_it(
+    make_loss, world_model, slices, run_seeded, assert_same_output, name, value, changed
+):
+    loss = make_loss("whole", world_model, value_replayed=0.5).eval()
+    before = run_seeded(loss, slices)
+    setattr(loss, name, value)
+    after = run_seeded(loss, slices)
+    assert before[changed] != after[changed]
+    built = make_loss("whole", world_model, **{"value_replayed": 0.5, name: value}).eval()
+    built.target_value_params.update_(loss.target_value_params)
+    assert_same_output(run_seeded(built, slices), after)
+
+
+def test_replayed_rewards_cannot_be_asked_for_where_the_loss_does_not_read_them(make_loss, slices):
+    pytest.raises(AttributeError, lambda: make_loss("policy").value_replayed)
+    loss = make_loss("value")
+    loss.value_replayed = 0.5
+    with pytest.raises(ValueError, match="^value_replayed can leave 0 only where the loss was built with it above 0"):
+        loss(slices)
+
+
+@pytest.mark.parametrize(("name", "known"), [("kl_direction", "backward, forward"), ("reduction", "none, mean, sum")])
+def test_a_misspelt_option_that_is_assigned_later_is_refused(make_loss, slices, name, known):
+    loss = make_loss("whole")
+    setattr(loss, name, "Backward")
+    with pytest.raises(ValueError, match=f"^{name} must be one of {known}, got 'Backward'"):
+        loss(slices)
+
+
+def test_hooks_of_torchrl_s_losses_say_what_there_is(make_loss, slices):
+    loss = make_loss("whole")
+    with pytest.raises(NotImplementedError, match="^EfficientTDMPCLoss makes its value targets itself"):
+        loss.make_value_estimator()
+    loss.set_vmap_randomness("different")
+    loss(slices)

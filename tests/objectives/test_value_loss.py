@@ -138,7 +138,7 @@ def test_targets_bootstrap_whatever_the_replayed_flags_say(
 ):
     loss = make_loss("whole", make_world_model(termination=termination)).eval()
     before = run_seeded(loss, slices)
-    for flag in ("terminated", "truncated", "done"):
+    for flag in ("terminated", "truncated"):
         slices["next", flag] = torch.ones_like(slices["next", flag])
     after = run_seeded(loss, slices)
     assert before["value_target"] == after["value_target"]

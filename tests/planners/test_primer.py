@@ -2,12 +2,24 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer
-from torchrl.envs import ActionScaling, Compose, InitTracker, SerialEnv, TransformedEnv
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    GymEnv,
+    InitTracker,
+    RenameTransform,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
+from torchrl.modules import AdditiveGaussianModule
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, StepCollector, WorldModel
+from torchrl_etdmpc.collectors import evaluate
 
 BUDGET = {"horizon": 2, "num_samples": 8, "num_elites": 2, "num_proposals": 2, "iterations": 1}
 SCALED = r"action has bounds of -2 and 2 instead of -1 and 1 \(append ActionScaling\(\)\)"
@@ -57,3 +69,66 @@ def test_a_collector_of_torchrl_compares_at_its_first_reset():
     env = make_env(2.0)
     with pytest.raises(ValueError, match=SCALED):
         Collector(env, make_planner(env), frames_per_batch=2, total_frames=2, auto_register_policy_transforms=True)
+
+
+@pytest.mark.parametrize("warm_start", [True, False])
+def test_a_planner_in_a_policy_of_several_modules_is_compared_by_our_collector(warm_start):
+    env, buffer = make_env(2.0), ReplayBuffer(storage=LazyTensorStorage(10))
+    with pytest.raises(ValueError, match=SCALED):
+        StepCollector(env, TensorDictSequential(make_planner(env, warm_start=warm_start)), replay_buffer=buffer)
+    with pytest.raises(ValueError, match=SCALED):
+        evaluate(env, TensorDictSequential(make_planner(env, warm_start=warm_start)), episodes=1)
+
+
+def pendulum(*transforms: Transform) -> TransformedEnv:
+    pytest.importorskip("gymnasium")
+    return TransformedEnv(GymEnv("Pendulum-v1"), Compose(InitTracker(), *transforms))
+
+
+@pytest.mark.parametrize("collect", ["ours", "torchrl's"])
+def test_a_planner_in_a_policy_of_several_modules_is_warm_started(collect, monkeypatch):
+    env = pendulum(ActionScaling())
+    planner, started = make_planner(env, action_dim=1), []
+    plan = planner.plan
+
+    def note(observation, plan_mean=None, **options):
+        started.append(plan_mean is not None)
+        return plan(observation, plan_mean, **options)
+
+    monkeypatch.setattr(planner, "plan", note)
+    noise = AdditiveGaussianModule(spec=env.action_spec, sigma_init=0.1, sigma_end=0.1, annealing_num_steps=1)
+    policy = TensorDictSequential(planner, noise)
+    if collect == "ours":
+        collector = StepCollector(
+            env, policy, replay_buffer=ReplayBuffer(storage=LazyTensorStorage(10)), total_frames=4
+        )
+    else:
+        collector = Collector(env, policy, frames_per_batch=4, total_frames=4, auto_register_policy_transforms=True)
+    for _ in collector:
+        pass
+    assert len(started) >= 4 and all(started)
+
+
+def test_what_other_modules_of_the_policy_read_or_write_is_not_asked_of_the_environment():
+    planner = make_planner(pendulum(), action_dim=1, action_key="unit_action")
+    env = pendulum(RenameTransform(["observation"], ["raw"]))
+    policy = TensorDictSequential(
+        TensorDictModule(lambda raw: raw, ["raw"], ["observation"]),
+        planner,
+        TensorDictModule(lambda action: 2 * action, ["unit_action"], ["action"]),
+    )
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10))
+    for step in StepCollector(env, policy, replay_buffer=buffer, total_frames=3):
+        torch.testing.assert_close(step["action"], 2 * step["unit_action"])
+    env = pendulum(RenameTransform(["observation"], ["raw"]))
+    for steps in Collector(env, policy, frames_per_batch=3, total_frames=3, auto_register_policy_transforms=True):
+        torch.testing.assert_close(steps["action"], 2 * steps["unit_action"])
+
+
+def test_alone_it_asks_the_environment_for_what_it_reads_and_writes():
+    env, buffer = make_env(), ReplayBuffer(storage=LazyTensorStorage(10))
+    planner = make_planner(env, observation_key="seen", action_key="torque")
+    with pytest.raises(ValueError, match=r"seen is missing .*; the actions are \['action'\] instead of one 'torque'"):
+        StepCollector(env, planner, replay_buffer=buffer)
+    with pytest.raises(KeyError, match="the planner needs 'seen' .* or append what check_env"):
+        next(iter(Collector(env, planner, frames_per_batch=2, total_frames=2, auto_register_policy_transforms=True)))

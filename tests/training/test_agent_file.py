@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.envs import import_task
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import (
     Agent,
@@ -154,8 +155,8 @@ def test_a_newer_file_replaces_the_older(tmp_path, saved):
     _, agent, config = saved
     path = tmp_path / "last.pt"
     for updates in (3, 4):
-        save_agent(str(path), agent, config, {"updates": updates})
-    assert read_agent_file(path)["counters"] == {"updates": 4}
+        save_agent(str(path), agent, config, {"env_steps": 0, "updates": updates})
+    assert read_agent_file(path)["counters"] == {"env_steps": 0, "updates": 4}
     assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
 
 
@@ -263,7 +264,7 @@ def test_an_environment_of_the_same_size_is_accepted(saved):
     assert agent.world_model.observation_dim == OBSERVATION_DIM
 
 
-@pytest.mark.parametrize("change", [{"mlp_dim": 32}, {"latent_dim": 20}, {"layers": 3}])
+@pytest.mark.parametrize("change", [{"mlp_dim": 32}, {"latent_dim": 20}])
 def test_weights_that_do_not_fit_their_configuration_are_refused(tmp_path, saved, change, config):
     config = saved[2].to_dict()
     path = edited(saved, tmp_path / "odd.pt", config={**config, "model": {**config["model"], **change}})
@@ -320,6 +321,29 @@ def test_an_agent_file_with_a_task_in_code_asks_for_it_on_the_command_line(tmp_p
     assert "task 'os:getcwd' names code, which must be given on the command line: task=os:getcwd" in message
 
 
+def test_a_setting_of_another_version_is_refused_with_the_file_s_name(tmp_path, saved):
+    config = saved[2].to_dict()
+    path = edited(saved, tmp_path / "newer.pt", config={**config, "planner": {**config["planner"], "newer": 1}})
+    assert refusal(path, load_agent).startswith("holds an agent that cannot be rebuilt: unknown setting planner.newer;")
+
+
+def test_what_a_task_of_one_s_own_was_is_stored_with_its_agent(tmp_path, saved, monkeypatch):
+    pytest.importorskip("gymnasium")
+    (tmp_path / "agents_own.py").write_text(
+        "from torchrl.envs import ActionScaling, GymEnv, TransformedEnv\n"
+        "def make(): return TransformedEnv(GymEnv('Pendulum-v1'), ActionScaling())\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import_task("agents_own:make", terminates=True)
+    config = TrainConfig.from_dict({**saved[2].to_dict(), "task": "agents_own:make", "episode_length": None})
+    path = save_agent(tmp_path / "own.pt", build_agent(config, 3, 1), config, COUNTERS)
+    trained, _, _ = load_agent(path)
+    import_task("agents_own:make", episode_length=50, terminates=False)  # as a command that is told otherwise
+    loaded, again, _ = load_agent(path)
+    assert (again.task_spec.episode_length, again.task_spec.terminates) == (200, True)
+    assert loaded.planner.discount == trained.planner.discount
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
@@ -328,6 +352,9 @@ def test_an_agent_file_with_a_task_in_code_asks_for_it_on_the_command_line(tmp_p
         ("world_model", 3, "is not a checkpoint: its world_model is of type int, not Mapping."),
         ("loss", {"scale": 1.0}, "is not a checkpoint: scale is no tensor but of type float."),
         ("loss", {"scale": torch.tensor(math.nan)}, "cannot be used: scale holds numbers that are not finite."),
+        ("config", {"preset": "cpu"}, "is not a whole checkpoint: its config lacks task."),
+        ("config", {"task": "cup-catch"}, "is not a whole checkpoint: its config lacks planner."),
+        ("counters", {"updates": 3}, "is not a whole checkpoint: its counters lacks env_steps."),
         ("world_model", {}, "does not fit its own configuration ("),
         ("updater", {}, "does not fit its own configuration ("),
         ("updater", {"optimizer": {"state": 3}}, "does not fit its own configuration ("),

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import StepCounter
+from torchrl.envs import StepCounter, Transform
 
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.planners import BarePolicy
@@ -62,6 +62,29 @@ def test_an_evaluation_leaves_the_caller_s_random_numbers_as_they_are(agent):
         torch.manual_seed(3), np.random.seed(3), random.seed(3)
         act()
         states.append((torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()))
+    assert states[0] == states[1]
+
+
+class DrawsFromGlobals(Transform):
+    """Seeds and draws from the generators that Python and NumPy share, as some simulators do."""
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        np.random.seed(5), random.seed(5)
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        np.random.rand(), random.random()
+        return next_tensordict
+
+
+def test_a_simulator_that_draws_from_global_generators_leaves_them_too(agent):
+    evaluator = make_evaluator(agent)
+    evaluator.env.append_transform(DrawsFromGlobals())
+    states = []
+    for act in (lambda: None, evaluator):
+        np.random.seed(3), random.seed(3)
+        act()
+        states.append((np.random.rand(3).tolist(), random.random()))
     assert states[0] == states[1]
 
 

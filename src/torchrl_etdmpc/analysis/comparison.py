@@ -235,7 +235,9 @@ def begins(curves: pd.DataFrame) -> pd.Series:
     >>> begins(curves).tolist()
     [10]
     """
-    return curves[curves["env_steps"] > 0].groupby(["method", "task"], sort=False)["env_steps"].min()
+    value = "return_mean" if "return_mean" in curves else "mean"
+    trained = curves[(curves["env_steps"] > 0) & curves[value].notna()]
+    return trained.groupby(["method", "task"], sort=False)["env_steps"].min()
 
 
 def _aggregate_rows(table: pd.DataFrame, tasks: tuple[str, ...], column: str) -> pd.DataFrame:

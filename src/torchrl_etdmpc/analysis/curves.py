@@ -12,8 +12,8 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,11 @@ POINT_COLUMNS = ("method", "task", "env_steps", "mean", "source")
 ESTIMATE_COLUMNS = ("method", "task", "env_steps", "mean", "standard_error", "seeds")
 CHANGED = ("action_repeat", "episode_length")
 """Settings of a task that a run may change, by their names in ``config.yaml``."""
+_NO_SETTING_OF_THE_METHOD = (
+    *("task", "seed", "run_dir", "resume", "total_env_steps", "eval_every", "eval_episodes", "eval_policy"),
+    *("device", "threads", "compile", "logger", "log_every", "checkpoint_every", "checkpoint_minutes"),
+    *("checkpoint_keep", "max_faults", "max_skipped", "workers", "engine", "overlap"),
+)
 _EVAL = RunDirectory("").eval.name
 _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
 
@@ -90,6 +95,7 @@ class Run:
         finished (bool): whether it reached its budget.
         curve (DataFrame): seed curve, see :func:`read_run`.
         changed (tuple of str): settings of the task that are not its own, e.g. ``episode_length=100``.
+        settings (mapping): those that say how it learns, by their dotted names; empty if they are not known.
 
     >>> Run(Path("runs/a/seed1"), "ours", "walker-walk", 1, True, pd.DataFrame()).method
     'ours'
@@ -102,23 +108,29 @@ class Run:
     finished: bool
     curve: pd.DataFrame
     changed: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(cls, run_dir: str | os.PathLike[str], *, method: str | None = None) -> Run:
         """Reads the files of a run; see :func:`read_run`."""
-        directory, header, table = RunDirectory(run_dir), read_header(run_dir), read_evaluations(run_dir)
-        settings = {name: header[name] for name in CHANGED if header[name] is not None}
-        _check_units(table.assign(task=header["task"]), directory.eval, settings.get("action_repeat"))
+        directory, (file, values) = RunDirectory(run_dir), _read_values(run_dir)
+        header, table = _header(file, values), read_evaluations(run_dir)
+        told = {name: header[name] for name in CHANGED if header[name] is not None}
+        _check_units(table.assign(task=header["task"]), directory.eval, told.get("action_repeat"))
         names = {"method": method or header["preset"], "task": header["task"], "seed": header["seed"]}
         columns = {name: table[name].astype(float) for name in ("env_steps", "return_mean")}
         curve = pd.DataFrame({**names, **columns})
-        changed = tuple(f"{name}={value}" for name, value in settings.items())
-        return cls(directory.path, **names, finished=directory.finished, curve=curve, changed=changed)
+        changed = tuple(f"{name}={value}" for name, value in told.items())
+        known = _flat(values) if file == directory.config else {}
+        settings = {name: value for name, value in known.items() if name not in _NO_SETTING_OF_THE_METHOD}
+        return cls(
+            directory.path, **names, finished=directory.finished, curve=curve, changed=changed, settings=settings
+        )
 
     @property
     def last(self) -> float:
-        """Env steps of the last evaluation, NaN if there is none."""
-        return self.curve["env_steps"].max()
+        """Env steps of the last evaluation with a return, NaN if there is none."""
+        return self.curve.dropna(subset="return_mean")["env_steps"].max()
 
 
 def read_run(run_dir: str | os.PathLike[str], *, method: str | None = None) -> pd.DataFrame:
@@ -157,6 +169,11 @@ def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
         FileNotFoundError: if it has neither ``config.yaml`` nor ``summary.json``.
         ValueError: if the file does not give them.
     """
+    return _header(*_read_values(run_dir))
+
+
+def _read_values(run_dir: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
+    """The file that says what a run is, and what it says."""
     directory = RunDirectory(run_dir)
     files = [file for file in (directory.config, directory.summary) if file.is_file()]
     if not files:
@@ -168,13 +185,24 @@ def read_header(run_dir: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is there
         values = json.loads(text) if files[0] == directory.summary else yaml.load(text, loader)
-        header = {key: values[key] for key in ("task", "preset", "seed")}
-    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+    except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"{files[0]} does not give the run's task, preset and seed.") from error
+    return files[0], values if isinstance(values, dict) else {}
+
+
+def _header(file: Path, values: Mapping[str, Any]) -> dict[str, Any]:
     kinds = {"task": str, "preset": str, "seed": int}
+    header = {key: values.get(key) for key in kinds}
     if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
-        raise ValueError(f"{files[0]} does not give the run's task, preset and seed.")
+        raise ValueError(f"{file} does not give the run's task, preset and seed.")
     return header | {name: values[name] if type(values.get(name)) is int else None for name in CHANGED}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
 
 
 def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
@@ -240,6 +268,31 @@ def join_runs(runs: Iterable[Run]) -> pd.DataFrame:
         seen[key] = run.path
         tables.append(run.curve)
     return pd.concat(tables, ignore_index=True)
+
+
+def mixed_settings(runs: Iterable[Run]) -> list[str]:
+    """A line for every method whose runs were trained with different settings, which a mean over them would hide.
+
+    Args:
+        runs (iterable of Run): what is not known of a run's settings is taken to be as the others have it.
+
+    >>> ours = [Run(Path(name), "ours", "walker-walk", seed, True, pd.DataFrame(), settings={"optim.lr": rate})
+    ...         for name, seed, rate in (("a", 1, 1e-3), ("b", 2, 3e-4))]
+    >>> mixed_settings(ours)
+    ['ours has runs with different settings: optim.lr is 0.001 in a and 0.0003 in b']
+    """
+    first: dict[str, Run] = {}
+    lines: dict[str, str] = {}
+    for run in runs:
+        other = first.setdefault(run.method, run) if run.settings else run
+        names = [name for name in other.settings if name in run.settings and run.settings[name] != other.settings[name]]
+        if names and run.method not in lines:
+            name, more = names[0], f", and {len(names) - 1} more" if len(names) > 1 else ""
+            lines[run.method] = (
+                f"{run.method} has runs with different settings: {name} is {other.settings[name]} in {other.path} and "
+                f"{run.settings[name]} in {run.path}{more}"
+            )
+    return list(lines.values())
 
 
 def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:

@@ -143,6 +143,8 @@ def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[
         target = budget or longest[run.task]
         where = f"{run.method} on {run.task} with seed {run.seed}"
         ends = f"ends at {run.last:,.0f} env steps" if run.last >= 0 else "has no evaluation"
+        if not run.last >= 0 and len(run.curve):
+            ends = "has no evaluation whose return is a number"
         if not run.finished:
             yield f"{where}: not finished, {ends}"
         elif run.last == 0:

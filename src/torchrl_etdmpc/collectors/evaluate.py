@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, ExplorationType, TensorDictPrimer
 from torchrl.envs.utils import set_exploration_type
+
+from torchrl_etdmpc.collectors.errors import NonFiniteError
 
 
 class Episodes(NamedTuple):
@@ -50,6 +52,7 @@ def evaluate(
         Episodes: the return and the length of each, shape ``[episodes]``.
 
     Raises:
+        NonFiniteError: if the environment returns a reward or an observation that is not finite.
         ValueError: if ``episodes`` is not positive, or the environment does not fit the planner's model, e.g. because
             its actions have other bounds.
 
@@ -61,7 +64,9 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
-    fitting_primer(env, policy)
+    fitting_primers(env, policy)
+    if len(env.reward_keys) != 1:
+        raise ValueError(f"a return is the sum of one reward, the environment has {env.reward_keys}; keep one of them.")
     num_envs = max(env.batch_size.numel(), 1)
     if policy_device is not None and torch.device(policy_device) == env.device:
         policy_device = None
@@ -73,18 +78,19 @@ def evaluate(
     return Episodes(returns, lengths)
 
 
-def fitting_primer(env: EnvBase, policy: nn.Module) -> TensorDictPrimer | None:
-    """The policy's primer, if it has one; one that knows what its policy's model takes compares it first.
+def fitting_primers(env: EnvBase, policy: nn.Module) -> list[TensorDictPrimer]:
+    """The primers of the policy and of the modules in it; one that knows what its model takes compares it first.
 
     Raises:
         ValueError: if environment and model do not fit.
     """
-    make_primer = getattr(policy, "make_tensordict_primer", None)
-    primer = None if make_primer is None else make_primer()
-    check = getattr(primer, "check", None)
-    if check is not None:
-        check(env)
-    return primer
+    modules: Iterable[Any] = policy.modules() if isinstance(policy, nn.Module) else [policy]
+    parts = [part for part in modules if hasattr(part, "make_tensordict_primer")]
+    primers = [part.make_tensordict_primer() for part in parts]
+    for part, primer in zip(parts, primers, strict=True):
+        if hasattr(primer, "check"):
+            primer.check(env, alone=part is policy)
+    return [primer for part, primer in zip(parts, primers, strict=True) if getattr(part, "warm_start", True)]
 
 
 def _round(
@@ -95,6 +101,8 @@ def _round(
     on_step: Callable[[TensorDictBase], None] | None,
 ) -> Episodes:
     """The first episode of every environment."""
+    observed = env.observation_spec.keys(include_nested=True, leaves_only=True)
+    reward, done = env.reward_keys[0], next(key for key in env.done_keys if "done" in (key, key[-1]))
     tensordict = env.reset()
     total, length = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.int64)
     running = torch.ones(num_envs, dtype=torch.bool)
@@ -106,9 +114,18 @@ def _round(
             outputs = policy(inputs).select(*policy.out_keys, strict=False)
             tensordict = tensordict.update(outputs.to(env.device or "cpu"))
         stepped, tensordict = env.step_and_maybe_reset(tensordict)
-        total += torch.where(running, stepped.get(("next", "reward")).reshape(num_envs).cpu(), 0)
+        _require_finite(stepped.get("next"), (reward, *observed), int(length.max()) + 1)
+        following = stepped.get("next")
+        total += torch.where(running, following.get(reward).reshape(num_envs).cpu(), 0)
         length += running
-        running &= ~stepped.get(("next", "done")).reshape(num_envs).cpu()
+        running &= ~following.get(done).reshape(num_envs).cpu()
         if on_step is not None:
             on_step(stepped)
     return Episodes(total, length)
+
+
+def _require_finite(following: TensorDictBase, keys: Iterable[NestedKey], decisions: int) -> None:
+    for key in keys:
+        value = following.get(key)
+        if value is not None and value.is_floating_point() and not value.isfinite().all():
+            raise NonFiniteError(f"the environment returned a non-finite {key!r} at decision step {decisions}")

@@ -16,21 +16,14 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_etdmpc.collectors.evaluate import fitting_primer
+from torchrl_etdmpc.collectors.errors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.collectors.evaluate import fitting_primers
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.worker import start_workers_anew
 from torchrl_etdmpc.keys import TRAJECTORY
 from torchrl_etdmpc.runs.errors import first_line
 
 Insertion = Literal["step", "episode"]
-
-
-class NonFiniteError(RuntimeError):
-    """The environment or the policy returned a value that is not finite."""
-
-
-class SimulatorError(RuntimeError):
-    """The environment raised an exception."""
 
 
 class StepCollector(BaseCollector):
@@ -107,7 +100,9 @@ class StepCollector(BaseCollector):
             raise ValueError(
                 f"StepCollector takes an environment with at most one batch dimension, got {env.batch_size}."
             )
-        self.env = _with_primer(env, policy)
+        if "done" not in env.done_keys:
+            raise ValueError(f"StepCollector needs the key 'done' of an environment, got {env.done_keys}; rename one.")
+        self.env = _with_primers(env, policy)
         self.policy = policy
         self.replay_buffer = replay_buffer
         self.total_frames = total_frames
@@ -368,12 +363,10 @@ def _truncate(rows: TensorDictBase) -> None:
             flag |= running
 
 
-def _with_primer(env: EnvBase, policy: nn.Module) -> EnvBase:
-    """Registers the policy's primer, as TorchRL's collectors do, unless the environment carries its keys already."""
-    primer = fitting_primer(env, policy)
-    if primer is None or not getattr(policy, "warm_start", True):
-        return env
-    present = set(env.full_observation_spec.keys(True, True)) | set(env.full_state_spec.keys(True, True))
-    if all(unravel_key(key) in present for key in primer.primers.keys(True, True)):
-        return env
-    return env.append_transform(primer)
+def _with_primers(env: EnvBase, policy: nn.Module) -> EnvBase:
+    """Registers the policy's primers, as TorchRL's collectors do, unless the environment carries their keys already."""
+    for primer in fitting_primers(env, policy):
+        present = set(env.full_observation_spec.keys(True, True)) | set(env.full_state_spec.keys(True, True))
+        if not all(unravel_key(key) in present for key in primer.primers.keys(True, True)):
+            env = env.append_transform(primer)
+    return env

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from torchrl_etdmpc.envs import Task, get_task
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.training import Agent, TrainConfig, build_planner, read_agent_file
+from torchrl_etdmpc.training import Agent, TrainConfig, build_planner, config_of, read_agent_file
 from torchrl_etdmpc.training.config import PlannerConfig
 
 
@@ -20,7 +23,8 @@ class AgentCommandConfig:
     checkpoint: str
     """An agent file, e.g. runs/walker-walk/cpu/seed1/checkpoints/best.pt."""
     task: str | None = None
-    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named."""
+    """Default: the task of the checkpoint. One of your own, ``module:function``, must be named, and what it trained
+    plays no other."""
     action_repeat: int | None = None
     """Environment steps per decision (``task.action_repeat`` on the command line). Default: as it was trained."""
     episode_length: int | None = None
@@ -39,10 +43,10 @@ class AgentCommandConfig:
         """The task that is named, or the one that the agent was trained on, with what its run changed about it."""
         changes = {name: getattr(self, name) for name in ("action_repeat", "episode_length", "terminates")}
         told = {name: value for name, value in changes.items() if value is not None}
-        stored = read_agent_file(self.checkpoint)["config"]
-        if self.task is not None and self.task != stored["task"]:
+        stored = trained_with(self.checkpoint)
+        if self.task is not None and self.task != stored.task:
             return get_task(self.task, **told)
-        return dataclasses.replace(TrainConfig.from_dict(stored).task_spec, **told)
+        return dataclasses.replace(stored.task_spec, **told)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +63,32 @@ class PlannerCommandConfig(AgentCommandConfig):
     @property
     def changed(self) -> dict[str, Any]:
         """The planner's settings that are not those of the agent's training."""
-        stored = TrainConfig.from_dict(read_agent_file(self.checkpoint)["config"]).planner
+        stored = trained_with(self.checkpoint).planner
         now = dataclasses.asdict(self.planner)
         return {name: value for name, value in now.items() if getattr(stored, name) != value}
 
 
+def trained_with(checkpoint: str) -> TrainConfig:
+    """The run that an agent file is of."""
+    return config_of(checkpoint, read_agent_file(checkpoint)["config"])
+
+
 def with_the_agent_s_planner(values: dict[str, Any], explicit: list[str]) -> dict[str, Any]:
     """A command's settings, with those of the planner that it does not name as the agent was trained with them."""
-    stored = read_agent_file(values["checkpoint"])["config"]["planner"]
+    stored = dataclasses.asdict(trained_with(values["checkpoint"]).planner)
     named: Mapping[str, Any] = values["planner"]
     return {**values, "planner": stored | {name: named[name] for name in named if f"planner.{name}" in explicit}}
+
+
+def make_folder(folder: Path, target: Path) -> None:
+    """Makes the folder of what a command will write, or says before its work that this target cannot be written.
+
+    Raises:
+        ValueError: if it cannot.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise ValueError(f"{target} cannot be written ({error.strerror}); choose another path.") from error

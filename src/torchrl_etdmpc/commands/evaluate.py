@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
-from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
+from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, make_folder, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
@@ -22,6 +20,7 @@ from torchrl_etdmpc.runs import write_film
 from torchrl_etdmpc.runs.files import write_whole
 from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
+from torchrl_etdmpc.training.config import MOST_EPISODES
 
 GIF_SIZE = 200  # pixels, for a page
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks
@@ -45,8 +44,8 @@ class EvaluateConfig(PlannerCommandConfig):
     """``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, got {self.episodes}.")
+        if not 1 <= self.episodes <= MOST_EPISODES:
+            raise ValueError(f"episodes must be between 1 and {MOST_EPISODES}, got {self.episodes}.")
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2**32 - 1], got {self.seed}.")
         if self.video is not None and Path(self.video).suffix not in (".mp4", ".gif"):
@@ -63,7 +62,8 @@ def main(config: EvaluateConfig) -> None:
         raise ValueError(f"planner.{name} changes nothing with policy=bare, which does not plan; leave one out.")
     for file in (config.video, config.csv):
         if file is not None:
-            _make_folder(Path(file).expanduser())
+            path = Path(file).expanduser()
+            make_folder(path.parent, path)
     device = resolve_device(config.device)
     task = config.task_spec
     env = make_env(task, seed=config.seed, num_envs=config.episodes, parallel=False)  # side by side
@@ -119,16 +119,6 @@ def _first(env: EnvBase) -> EnvBase:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env._envs[0] if isinstance(env, SerialEnv) else env
-
-
-def _make_folder(file: Path) -> None:
-    """Makes the folder of a file, or says before the episodes that it cannot be written there."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(file.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    except OSError as error:
-        raise ValueError(f"{file} cannot be written ({error.strerror}); choose another path.") from error
 
 
 def _table(task: Task, played: Episodes) -> str:

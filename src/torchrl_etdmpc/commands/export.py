@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig, make_folder
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.planners import export_planner, export_policy
@@ -36,6 +36,7 @@ def main(config: ExportConfig) -> None:
     if out.exists() and not out.is_dir():
         raise ValueError(f"out={config.out} is a file; name a folder.")
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
+    make_folder(out, out)
     if config.task not in (None, run.task):
         raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
     model = agent.acting_model
@@ -52,7 +53,6 @@ def main(config: ExportConfig) -> None:
             torch.manual_seed(0)
             actions.append(plan(observation, plan_mean)[0])
         torch.testing.assert_close(*actions)
-    out.mkdir(parents=True, exist_ok=True)
     for name, program in (("policy", policy), ("planner", planner)):
         with replacing(out / f"{name}.pt2") as partial:
             torch.export.save(program, partial)

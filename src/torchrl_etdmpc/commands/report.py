@@ -136,7 +136,7 @@ def choose_budget(
     """The budget and the step of the AUC's grid: what was asked for or planned, the benchmark's, or what all reach."""
     from torchrl_etdmpc.analysis import BENCHMARKS, begins
 
-    last = runs.groupby(["method", "task", "seed"])["env_steps"].max()
+    last = ends(runs)
     reached = int(last.min())
     present = set(runs["task"])
     planned = {
@@ -161,6 +161,8 @@ def choose_budget(
         step = next((step for step in steps if step >= first), steps[-1] if steps else None)
         if step is None and arguments.budget:
             raise ValueError(f"--budget={budget} has no grid of equal steps; take {budget - 1} or {budget + 1}.")
+        if budget < 2:
+            raise ValueError("the runs end at 1 env step, which makes no curve; wait for an evaluation after it.")
         if step is None:
             budget, step = budget - 1, (budget - 1) // 2
     return budget, arguments.grid_step or step
@@ -178,8 +180,7 @@ def choose_benchmark(arguments: argparse.Namespace, runs: Table) -> Benchmark:
         return benchmark_of(present)
     if len(own) < len(present):
         raise ValueError(f"{own[0]} is of no benchmark, other runs are; report them apart, or pass --benchmark.")
-    reached = runs.groupby(["method", "task", "seed"])["env_steps"].max().min()
-    return own_benchmark(own, max(int(reached), 1))
+    return own_benchmark(own, max(reached(runs), 1))
 
 
 def report(arguments: argparse.Namespace, references: list[Table], points: Table) -> str:
@@ -192,15 +193,17 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         evaluated_methods,
         incomplete_runs,
         join_curves,
+        mixed_settings,
         write_report,
     )
 
     found, runs, experiments, lines = read(arguments)
-    for line in lines:
+    mixed = mixed_settings(found)
+    for line in [*lines, *mixed]:
         print(line, file=sys.stderr, flush=True)
     # A run that has just begun would make nothing of the comparison; it is named as unfinished.
-    last = runs.groupby(["method", "task", "seed"])["env_steps"].transform("max")
-    runs = runs[last > 0]
+    evaluated = runs["env_steps"].where(runs["return_mean"].notna())
+    runs = runs[evaluated.groupby([runs["method"], runs["task"], runs["seed"]]).transform("max") > 0]
     if runs.empty:
         raise ValueError("no evaluation after 0 env steps in any of the runs yet; wait for the first one.")
     present = list(dict.fromkeys(runs["task"]))
@@ -241,7 +244,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         points=points,
         **choose_base(arguments, chosen, methods, experiments),
     )
-    notes = [f"{line}." for line in unused]
+    notes = [f"{line}." for line in (*unused, *mixed)]
     notes += [f"{task} was run with {settings}, not as the benchmark has it." for task, settings in changed.items()]
     if shorter:
         where = ", ".join(sorted(shorter))
@@ -266,9 +269,14 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     return f"{counts}, up to {last:,.0f} env steps{at}; the report is {page}"
 
 
+def ends(runs: Table) -> Table:
+    """Env steps of each run's last return that is a number."""
+    return runs.dropna(subset="return_mean").groupby(["method", "task", "seed"])["env_steps"].max()
+
+
 def reached(runs: Table) -> int:
     """Env steps that all runs reach."""
-    return int(runs.groupby(["method", "task", "seed"])["env_steps"].max().min())
+    return int(ends(runs).min())
 
 
 def missing(lines: list[str], shown: int = 5) -> str:

@@ -46,7 +46,7 @@ WHAT = """Trains every run of an experiment: tasks x seeds x variants.
   suite experiment=NAME               all runs, each gone on with wherever it is; finished ones cost nothing
   suite status experiment=NAME        where they are, also while they are trained elsewhere
   suite list                          the experiments by name
-  suite experiment=NAME preset=cpu tasks=walker-walk,cup-catch seeds=2 total_env_steps=50000
+  suite experiment=insertion preset=cpu tasks=walker-walk,cup-catch seeds=2 total_env_steps=50000
 
 Any setting of train does as well, for all variants, but for those of one run: task, seed, run_dir and resume."""
 
@@ -140,6 +140,7 @@ def main() -> None:
         return
     whole = asked if stored is None else extended(stored, asked, folder)
     runs = asked.runs(folder)
+    _require_differences(whole, folder)
     _require_parts(runs)
     if config.dry_run:
         print(_plan(asked, runs))
@@ -155,6 +156,22 @@ def main() -> None:
         _write_for_slurm(config, asked, runs, folder)
         return
     sys.exit(_carry_out(config, asked, runs, folder))
+
+
+def _require_differences(experiment: Experiment, folder: Path) -> None:
+    """No two variants are one run under two names, as a command's settings can make them. A search may."""
+    first: dict[tuple[str, str], str] = {}
+    for run in experiment.runs(folder):
+        if run.seed != experiment.seeds[0] or any(run.variant.startswith(f"{it} trial ") for it in experiment.searches):
+            continue
+        settings = {**run.config.to_dict(), "preset": None, "run_dir": None}
+        twin = first.setdefault((run.task, repr(settings)), run.variant)
+        if twin != run.variant:
+            raise ValueError(
+                f"variants {twin!r} and {run.variant!r} of experiment {experiment.name} have the same settings on "
+                f"{run.task}: one run under two names. Settings of the command take the place of each variant's own; "
+                f"leave those out, or write variants={run.variant!r} with a runs_dir of its own."
+            )
 
 
 def _require_parts(runs: Iterable[Run]) -> None:

@@ -56,7 +56,7 @@ def check_spaces(
     env: EnvBase,
     *,
     observation_dim: int | None,
-    action_dim: int,
+    action_dim: int | None,
     dtype: torch.dtype = torch.float32,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
@@ -69,7 +69,8 @@ def check_spaces(
     Keyword Args:
         observation_dim (int, optional): O that the model takes; ``None`` if it encodes what it likes, which is not
             checked.
-        action_dim (int): A that the model takes.
+        action_dim (int, optional): A that the model takes; ``None`` if what acts writes another action, which is not
+            checked.
         dtype (torch.dtype): of both. Default: float32.
         observation_key (NestedKey): Default: ``"observation"``.
         action_key (NestedKey): Default: ``"action"``.
@@ -109,14 +110,15 @@ def _spaces(
     env: EnvBase,
     *,
     observation_dim: int | None = _ANY_SIZE,
-    action_dim: int = _ANY_SIZE,
+    action_dim: int | None = _ANY_SIZE,
     dtype: torch.dtype = torch.float32,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
 ) -> Iterator[str]:
     if observation_dim is not None:
         yield from _observation(env, unravel_key(observation_key), observation_dim, dtype)
-    yield from _action(env, unravel_key(action_key), action_dim, dtype)
+    if action_dim is not None:
+        yield from _action(env, unravel_key(action_key), action_dim, dtype)
 
 
 def _observation(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) -> Iterator[str]:

@@ -64,11 +64,11 @@ def import_task(
         maker = partial(_make_limited, found)
         env = _call(found, path)
         repeat, limit = _action_repeat(env), _limit(env)
-        env.close()
         if limit is None and "episode_length" not in told:
             raise ValueError(f"task {path!r} shows no time limit; give one in env steps: task.episode_length=")
         task = Task(path, "user", **({"action_repeat": repeat, "episode_length": limit} | told))
-        _require_agreement(task, repeat, limit)
+        _require_agreement(task, env)
+        env.close()
     register_task(task, maker, replace=True)
     return task
 
@@ -123,15 +123,16 @@ def _make_as(name: str, make: Maker, task: Task, *, device: torch.device | str) 
 def _make_limited(function: Callable[[], EnvBase], task: Task, *, device: torch.device | str) -> EnvBase:
     """A function's environment, which must be what the task says it is."""
     env = _call(function, task.name)
-    repeat, limit = _action_repeat(env), _limit(env)
-    _require_agreement(task, repeat, limit)
+    _require_agreement(task, env)
+    limit = _limit(env)
     if limit is None or task.episode_length < limit:
         # Under a name of its own, beside a StepCounter that the environment may have.
         env = env.append_transform(StepCounter(task.decision_steps_per_episode, step_count_key="decision_count"))
     return env.to(device)
 
 
-def _require_agreement(task: Task, repeat: int, limit: int | None) -> None:
+def _require_agreement(task: Task, env: EnvBase) -> None:
+    repeat, limit = _action_repeat(env), _limit(env)
     if task.action_repeat != repeat:
         raise ValueError(
             f"action_repeat of task {task.name!r} must be {repeat}, which is how often its environment repeats an "
@@ -141,6 +142,12 @@ def _require_agreement(task: Task, repeat: int, limit: int | None) -> None:
         raise ValueError(
             f"episode_length of task {task.name!r} must be at most {limit}, its environment's own limit, got "
             f"{task.episode_length}."
+        )
+    if task.terminates and any(isinstance(layer, FrameSkipTransform) for layer in _layers(env)):
+        raise ValueError(
+            f"task {task.name!r} repeats actions with FrameSkipTransform, which steps on where an episode has ended; "
+            "repeat them with frame_skip= of GymEnv or DMControlEnv, or in a step of your own, or say that only the "
+            "time limit ends its episodes: task.terminates=false."
         )
 
 

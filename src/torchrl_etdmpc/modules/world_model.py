@@ -171,6 +171,7 @@ class WorldModel(nn.Module):
         self.termination_head = (
             TerminationHead(latent_dim, hidden_dim=mlp_dim, activation=activation) if termination else None
         )
+        self._bin_ends = (bin_min, bin_max)
         self.register_buffer("bins", torch.linspace(bin_min, bin_max, num_bins))
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
         """How many gradient updates made these weights, skipped ones included; stamped on every planner target."""
@@ -186,6 +187,7 @@ class WorldModel(nn.Module):
         """Draws new weights in every network (the hook that TorchRL's losses call)."""
         for network in self.children():
             draw_new_weights(network)
+        self.bins.copy_(torch.linspace(*self._bin_ends, len(self.bins)))  # made on the meta device they have no values
         self.version.zero_()
 
     def encode(self, observation: Any) -> Tensor:

@@ -19,6 +19,8 @@ from torchrl_etdmpc.objectives.latent_rollout import (
 )
 from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term
 
+_DIRECTIONS = get_args(KLDirection)
+
 
 class Distillation(NamedTuple):
     """Divergence from the planner's target and entropy of the policy."""
@@ -57,6 +59,7 @@ def distillation(
     >>> distillation(world_model, latent, mean, log_std.exp()).kl.tolist()  # it is the plan already
     [0.0, 0.0, 0.0, 0.0]
     """
+    _check_direction(kl_direction)
     mean, log_std = world_model.policy(latent.detach())
     policy = (mean, log_std.exp())
     plan = (plan_loc, plan_scale)
@@ -115,11 +118,15 @@ def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_directi
     """Checks the options of the distillation and registers its running scale on the loss."""
     if not 0 <= scale_tau <= 1:
         raise ValueError(f"scale_tau must be in [0, 1], got {scale_tau}.")
-    if kl_direction not in get_args(KLDirection):
-        raise ValueError(f"kl_direction must be one of {', '.join(get_args(KLDirection))}, got {kl_direction!r}.")
+    _check_direction(kl_direction)
     loss.scale_tau = scale_tau
     loss.kl_direction = kl_direction
     loss.register_buffer("kl_scale", torch.ones((), device=loss.rho.device))
+
+
+def _check_direction(kl_direction: str) -> None:
+    if kl_direction not in _DIRECTIONS:
+        raise ValueError(f"kl_direction must be one of {', '.join(_DIRECTIONS)}, got {kl_direction!r}.")
 
 
 def policy_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float) -> Term:

@@ -14,7 +14,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
+from torchrl_etdmpc.keys import ACTION, DONE, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.modules.new_weights import draw_new_weights
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, counted_mean, latent_rollout
@@ -31,6 +31,7 @@ PRIORITY = "priority"
 """Under which name among its metrics a term offers errors ``[T, B]`` to make priorities of, where there are weights."""
 _FEATURES = ("action", "reward", "terminated", "plan_loc", "plan_scale")
 _OBSERVATIONS = ("observation", "next_observation")
+_REDUCTIONS = get_args(Reduction)
 _FIELDS = (*_OBSERVATIONS, *_FEATURES)
 
 
@@ -116,8 +117,14 @@ class Term:
         return error, metrics
 
 
+def _check_reduction(reduction: str) -> None:
+    if reduction not in _REDUCTIONS:
+        raise ValueError(f"reduction must be one of {', '.join(_REDUCTIONS)}, got {reduction!r}.")
+
+
 def _reduced(term: Tensor, slices: Slices, reduction: Reduction) -> Tensor:
     """A term ``[T, B]`` to a scalar, or to ``[B, T]`` without reduction; steps that do not count are zeros."""
+    _check_reduction(reduction)
     if slices.weights is None and reduction == "mean":
         return counted_mean(term, slices.counts)
     weights = slices.weights
@@ -267,8 +274,7 @@ class LatentRolloutLoss(LossModule):
         self._in_keys = None
         self._out_keys = None
         self.reduction = "mean" if reduction is None else reduction
-        if self.reduction not in get_args(Reduction):
-            raise ValueError(f"reduction must be one of {', '.join(get_args(Reduction))}, got {reduction!r}.")
+        _check_reduction(self.reduction)
         if not 0 < rho <= 1:
             raise ValueError(f"rho must be in (0, 1], got {rho}.")
         _check_terms(terms, extra_terms, taken=self._attributes)
@@ -298,7 +304,8 @@ class LatentRolloutLoss(LossModule):
 
     def __setattr__(self, name: str, value: Any) -> None:
         # TorchRL has a list of such buffers for a class; here each loss has those of its terms.
-        if isinstance(value, int | float) and name in vars(self).get("_scalars", ()):
+        scalars = (*vars(self).get("_scalars", ()), "rho")
+        if isinstance(value, int | float) and name in scalars and name in self._buffers:
             self.get_buffer(name).fill_(value)
         else:
             super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]  # TorchRL's annotation is too narrow
@@ -314,6 +321,20 @@ class LatentRolloutLoss(LossModule):
         self.__dict__["world_model"]._apply(fn)
         self._read_networks()  # a cast keeps parameters and replaces buffers
         return self
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """There is none to choose: the value targets are the terms' own.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} makes its value targets itself, imagined ones and with value_replayed=... n-step "
+            "returns of what was replayed; there is no estimator to choose."
+        )
+
+    def _make_vmap(self) -> None:
+        """TorchRL's hook for losses that use vmap with random numbers: the ensembles here are stacked, without it."""
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         self._in_keys = None  # a new name for a key changes what dispatch expects
@@ -445,6 +466,7 @@ class LatentRolloutLoss(LossModule):
                 raise self._shape_error(reads[name], entry)
         counts = self._counted_steps(tensordict, entries["action"].shape[:2])
         self._refuse_termination(tensordict, counts)
+        self._refuse_gaps(tensordict, counts, entries["action"].shape[:2])
         for name, entry in entries.items():
             if counts is not None:
                 # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
@@ -455,6 +477,8 @@ class LatentRolloutLoss(LossModule):
         for name in ("reward", "terminated"):
             if fields[name] is not None:
                 fields[name] = fields[name].squeeze(-1)
+        if fields["terminated"] is not None:
+            fields["terminated"] = fields["terminated"].bool()
         counts = None if counts is None else counts.transpose(0, 1)
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
         prioritised = weights is not None
@@ -520,8 +544,8 @@ class LatentRolloutLoss(LossModule):
             if now is not first or {id(parameter) for parameter in network.parameters()} != self._trained[name][1]:
                 raise RuntimeError(
                     f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
-                    "assign=True) and a new module or layer put new parameters there; load without assign, or build "
-                    "the loss and its optimizer afterwards."
+                    "assign=True), a new module or layer and to_module() of the loss put other parameters there; load "
+                    "without assign, build the loss and its optimizer afterwards, or swap those of the world model."
                 )
             target: Any = self._modules.get(f"target_{name}_params")
             if target is None or now is None:
@@ -574,6 +598,26 @@ class LatentRolloutLoss(LossModule):
                 f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
                 "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
                 f"{type(self).__name__}(..., ignore_termination=True) if that is what you want."
+            )
+
+    def _refuse_gaps(self, tensordict: TensorDictBase, counts: Tensor | None, shape: torch.Size) -> None:
+        """Steps must follow each other, one at a time: what n-step returns and episodes side by side do not."""
+        if torch.compiler.is_compiling():
+            return
+        done, steps = tensordict.get((NEXT, DONE), None), tensordict.get("steps_to_next_obs", None)
+        if steps is not None and steps.device.type == "cpu" and (steps != 1).any():
+            raise ValueError(
+                "'steps_to_next_obs' is not 1 everywhere: these losses learn single steps, and n-step rewards and "
+                "observations would be taken for those of one; leave MultiStep out, value_replayed=... has n-step "
+                "targets."
+            )
+        if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
+            return
+        inside = done.reshape(shape)[:, :-1].bool()
+        if (inside if counts is None else inside & counts[:, 1:]).any():
+            raise ValueError(
+                f"{(NEXT, DONE)!r} is True before the last step of a slice, so that another episode follows in it; "
+                "sample slices of one episode each (StepSliceSampler), or mask what follows (loss_mask_key)."
             )
 
     @dispatch  # pyright: ignore[reportArgumentType]

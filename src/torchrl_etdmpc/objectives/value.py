@@ -248,9 +248,11 @@ def value_term(
     if not 0 < value_expectile < 1:
         raise ValueError(f"value_expectile must be in (0, 1), got {value_expectile}; 0.5 is the mean.")
     paid = ("reward",) if world_model.termination_head is None else ("reward", "terminated")
+    # Plain numbers, which the target is built by: a tensor would be waited for at every step.
+    vars(loss).update(value_beta=value_beta, value_replayed=value_replayed, value_expectile=value_expectile)
     return Term(
         "value",
-        partial(_value, loss, value_beta, value_replayed, value_expectile),
+        partial(_value, loss),
         value_coef,
         networks=("encoder", "dynamics", "value"),
         targets=("value",),
@@ -261,10 +263,7 @@ def value_term(
 
 
 def _value(
-    loss: LatentRolloutLoss,
-    value_beta: float,
-    value_replayed: float,
-    value_expectile: float,
+    loss: Any,
     world_model: WorldModel,
     slices: Slices,
     rollout: LatentRollout,
@@ -277,12 +276,14 @@ def _value(
 
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
     target = torch.zeros_like(rollout.encoded[:-1, :, 0])
+    value_beta, value_replayed = loss.value_beta, loss.value_replayed
     if value_replayed < 1:
         latent, noise = rollout.encoded[:-1], torch.randn_like(slices.action)
         imagined = imagined_value_target(world_model, values, latent, noise, loss.discount, value_beta)
         target = target + (1 - value_replayed) * imagined
     if value_replayed:
-        assert slices.reward is not None
+        if slices.reward is None:
+            raise ValueError("value_replayed can leave 0 only where the loss was built with it above 0.")
         terminated = None if world_model.termination_head is None else slices.terminated
         ends: Any = {"terminated": terminated, "counts": slices.counts}
         paid = replayed_value_target(values, rollout.encoded[1:], slices.reward, loss.discount, value_beta, **ends)
@@ -290,5 +291,5 @@ def _value(
     metrics = {"value_target": target}
     if slices.prioritised:
         metrics[PRIORITY] = td_error(world_model, rollout, target)
-    error = value_error(world_model, rollout, target, dropout=loss.training, expectile=value_expectile)
+    error = value_error(world_model, rollout, target, dropout=loss.training, expectile=loss.value_expectile)
     return error, metrics

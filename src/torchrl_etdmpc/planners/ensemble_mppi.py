@@ -344,7 +344,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             either = "" if self.latent_key is None else f" (or {self.latent_key!r})"
             raise KeyError(
                 f"the planner needs {self.observation_key!r}{either} in its input; pass observation_key=... if your "
-                "environment names it otherwise."
+                "environment names it otherwise, or append what check_env(env) names."
             )
         if observation is not None and latent is not None:
             raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.envs import EnvBase, TensorDictPrimer
 
 from torchrl_etdmpc.envs.check import check_spaces
@@ -13,7 +13,8 @@ from torchrl_etdmpc.envs.check import check_spaces
 class PlanPrimer(TensorDictPrimer):
     """Zeroes the carried plan at every reset, and compares environment and model at the first one.
 
-    It compares then and not when it is appended, because transforms that come later may mend the environment.
+    It compares then and not when it is appended, because transforms that come later may mend the environment. What the
+    environment does not have, other modules of the policy may write or read, so that is not compared there.
 
     Args:
         *args: those of :class:`torchrl.envs.TensorDictPrimer`.
@@ -31,15 +32,26 @@ class PlanPrimer(TensorDictPrimer):
         self.latent_key = latent_key
         self._checked = False
 
-    def check(self, env: EnvBase) -> None:
-        """Raises a ``ValueError`` that says what to append if the environment does not fit the planner's model."""
+    def check(self, env: EnvBase, *, alone: bool = True) -> None:
+        """Raises a ``ValueError`` that says what to append if the environment does not fit the planner's model.
+
+        Args:
+            env (EnvBase): the environment.
+
+        Keyword Args:
+            alone (bool): whether the planner is the whole policy, so that what the environment lacks is a fault.
+                Default: ``True``.
+        """
         written = set(env.full_observation_spec.keys(True, True))
-        imagined = self.latent_key in written and self.spaces["observation_key"] not in written
-        spaces: dict[str, Any] = {**self.spaces, "observation_dim": None} if imagined else self.spaces
+        spaces = dict(self.spaces)
+        if unravel_key(spaces["observation_key"]) not in written and (self.latent_key in written or not alone):
+            spaces["observation_dim"] = None
+        if unravel_key(spaces["action_key"]) not in env.action_keys and not alone:
+            spaces["action_dim"] = None
         check_spaces(env, **spaces)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if not self._checked and self.container is not None:
-            self.check(self.container)
+            self.check(self.container, alone=False)
             self._checked = True
         return super()._reset(tensordict, tensordict_reset)

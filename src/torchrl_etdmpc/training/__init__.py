@@ -2,7 +2,7 @@
 
 from torchrl_etdmpc.checkpoints import CheckpointError
 from torchrl_etdmpc.training.agent import Agent, build_agent, build_planner, build_world_model
-from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent, load_agent, read_agent_file, save_agent
+from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent, config_of, load_agent, read_agent_file, save_agent
 from torchrl_etdmpc.training.builders import (
     build_collector,
     build_reanalyze,
@@ -35,6 +35,7 @@ __all__ = [
     "CHANGEABLE",
     "TASK_SETTINGS",
     "config_from_dict",
+    "config_of",
     "follow_own_code",
     "EXIT_CODE",
     "PRESETS",

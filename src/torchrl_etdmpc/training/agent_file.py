@@ -21,7 +21,7 @@ from torchrl_etdmpc.runs.files import (
     write_whole,
 )
 from torchrl_etdmpc.training.agent import Agent, build_agent
-from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 
 FORMAT = 2
 _ENTRIES = {
@@ -59,6 +59,8 @@ class AgentFile:
     def state_dict(self) -> dict[str, Any]:
         """The content of the file."""
         settings = self.config.to_dict()
+        if ":" in self.config.task:  # what the task was: a command that loads the agent may be told otherwise
+            settings |= {name: getattr(self.config.task_spec, name) for name in TASK_SETTINGS}
         return {
             "format": FORMAT,
             "config": {field.name: settings[field.name] for field in dataclasses.fields(TrainConfig)},  # not of workers
@@ -182,6 +184,9 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
         if not isinstance(content[name], kind):
             found = type(content[name]).__name__
             raise CheckpointError(f"{path} is not a checkpoint: its {name} is of type {found}, not {kind.__name__}.")
+    for name, entry in (("config", "task"), ("config", "planner"), ("counters", "env_steps")):
+        if entry not in content[name]:
+            raise CheckpointError(f"{path} is not a whole checkpoint: its {name} lacks {entry}.")
     for name, value in (*content["world_model"].items(), *content["loss"].items()):
         if not isinstance(value, torch.Tensor):
             raise CheckpointError(
@@ -190,6 +195,24 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
         if value.is_floating_point() and not value.isfinite().all():
             raise CheckpointError(f"{path} cannot be used: {name} holds numbers that are not finite.")
     return content
+
+
+def config_of(path: str | Path, values: Mapping[str, Any]) -> TrainConfig:
+    """The run that an agent file is of, from what it stores.
+
+    Raises:
+        CheckpointError: if this version, or this process, knows no such run.
+
+    >>> from torchrl_etdmpc.training import preset
+    >>> config_of("last.pt", preset("cpu").to_dict()).preset
+    'cpu'
+    """
+    try:
+        return TrainConfig.from_dict(values)
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"{path} holds an agent that cannot be rebuilt: {' '.join(str(error).split())}"
+        ) from error
 
 
 def load_agent(
@@ -237,8 +260,8 @@ def load_agent(
     values = dict(content["config"])
     if compile_setting is not None:
         values["compile"] = compile_setting
+    config = config_of(path, values)
     try:
-        config = TrainConfig.from_dict(values)
         agent = build_agent(config, *saved, device=device)
         agent.load_state_dict(content)
     except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:

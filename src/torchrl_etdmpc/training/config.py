@@ -27,6 +27,8 @@ from torchrl_etdmpc.training.own_code import OWN_CODE, own_code
 
 TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
 """Written as ``task.action_repeat`` etc. on the command line; ``task`` itself is a name, not a group."""
+MOST_EPISODES = 10_000
+"""Of one evaluation: each is an environment in memory."""
 
 
 @dataclass(frozen=True)
@@ -278,7 +280,11 @@ class TrainConfig:
             **coefficients,
         }.items():
             _require(number >= 0, f"{name} must not be negative, got {number}.")
-        for name, most in {"num_envs": 4096, "threads": 4096, "eval_episodes": 10_000}.items():  # each is one in memory
+        for name, most in {
+            "num_envs": 4096,
+            "threads": 4096,
+            "eval_episodes": MOST_EPISODES,
+        }.items():  # each is one in memory
             _require((getattr(self, name) or 0) <= most, f"{name} must be at most {most}, got {getattr(self, name)}.")
         self._check_against_the_episode(self.task_spec)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import random
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import nn
@@ -13,6 +16,17 @@ from torchrl.envs import EnvBase
 from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.training.agent import Agent
+
+
+@contextlib.contextmanager
+def _forked_global_generators() -> Iterator[None]:
+    """Gives Python's and NumPy's global generators back as they were; simulators may draw from them."""
+    ours, numpys = random.getstate(), np.random.get_state()
+    try:
+        yield
+    finally:
+        random.setstate(ours)
+        np.random.set_state(numpys)
 
 
 class EvaluationResult(NamedTuple):
@@ -36,8 +50,9 @@ class EvaluationResult(NamedTuple):
 class Evaluator:
     """Plays the same episodes every time, so that what differs between two evaluations of a run is the agent.
 
-    Initial states and random numbers follow from ``seed`` alone, and those of the caller stay as they are: training is
-    the same whether it is evaluated or not, and a run that goes on needs nothing of its former evaluations.
+    Initial states and random numbers follow from ``seed`` alone, and those of the caller stay as they are, PyTorch's
+    and those of the generators that Python and NumPy share with simulators of this process: training is the same
+    whether it is evaluated or not, and a run that goes on needs nothing of its former evaluations.
 
     Args:
         env (EnvBase): batch size [] or [n], without the planner's warm start; closed by :meth:`close`.
@@ -85,7 +100,7 @@ class Evaluator:
             on_step (callable, optional): called with the tensordict of every step; an exception ends the evaluation.
         """
         device = self.agent.device
-        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), _forked_global_generators():
             played = self._play(self.agent.eval_planner, on_step)
             bare = self._play(BarePolicy(self.agent.acting_model), on_step) if self.with_policy else None
         returns, least = played.returns, self.success_return
