@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -12,6 +13,7 @@ pytest.importorskip("pandas")
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
+from PIL import Image  # noqa: E402
 
 from torchrl_etdmpc.analysis import AGGREGATE, Comparison, compare, get_benchmark, write_report  # noqa: E402
 
@@ -20,6 +22,11 @@ STEPS = (0, 100_000, 200_000)
 TEXTS = {"auc.csv", "auc.md", "final.csv", "final.md", "index.md", "returns.csv"}
 FIGURES = {"curves", "aggregate", "auc"}
 FILES = TEXTS | {f"{name}.png" for name in FIGURES}
+
+
+def draw(file: BinaryIO, size: int = 4) -> None:
+    """A picture of noise, which takes a byte a pixel."""
+    Image.effect_noise((size, size), 50).save(file, "png")
 
 
 def comparison(
@@ -73,6 +80,7 @@ def test_a_report_is_exactly_its_files_and_nothing_is_left_beside_it(report):
 def test_figures_are_pictures(report):
     for name in FIGURES:
         assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert Image.open(report / f"{name}.png").mode == "P"  # a third of the bytes
         assert b"<svg" in (report / f"{name}.svg").read_bytes()
 
 
@@ -140,7 +148,7 @@ def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_
         calls.append(file)
         if len(calls) == which:
             raise RuntimeError("no figure today")
-        file.write(b"picture")
+        draw(file)
 
     monkeypatch.setattr(Figure, "savefig", save)
     with pytest.raises(RuntimeError, match="no figure today"):
@@ -150,7 +158,7 @@ def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_
 
 
 def test_a_full_disk_leaves_the_old_report_as_it_was_and_nothing_beside_it(monkeypatch, small_disk, leave_free):
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(bytes(40_000)))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: draw(file, 200))
     out = small_disk / "report"
     write_report(comparison(), out)
     old = contents(out)
@@ -177,7 +185,7 @@ def test_a_figure_that_fails_makes_no_report(monkeypatch, tmp_path):
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page and the tables only, which is much faster."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b"picture"))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: draw(file))
 
 
 def test_one_seed_is_a_mean_whose_missing_interval_the_page_explains(without_figures, tmp_path):

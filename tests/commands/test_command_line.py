@@ -56,6 +56,11 @@ WRONG = [
     (("optim.lr=inf",), "optim.lr must be a finite number below 1e30, got inf."),
     (("total_env_steps=1e400",), "total_env_steps must be a whole number below 2**53, got inf."),
     (("run_dir=${nope}",), "run_dir cannot be read: Interpolation key 'nope' not found"),
+    (
+        ("--multirun", "seed=1,2", "run_dir=here"),
+        "run_dir=here would be that of every run; leave it out, or put what differs into it, e.g. "
+        "run_dir='runs/${seed}'.",
+    ),
     (("--help", "planer"), "there is no group and no setting 'planer'; did you mean planner? --help lists all."),
 ]
 
@@ -90,6 +95,8 @@ def test_a_flag_may_stand_between_settings(run_command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # a sweep of Hydra's keeps a folder
     assert "horizon: 4" in run_command("preset=cpu", "--cfg", "job", "planner.horizon=4")
     assert run_command("preset=cpu", "--multirun", "seed=3,4").seed == 3
+    assert run_command("preset=cpu", "--multirun", "seed=3", "run_dir=one").run_dir == "one"
+    assert run_command("preset=cpu", "--multirun", "seed=3,4", "run_dir=runs/${seed}").run_dir == "runs/3"
 
 
 def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):

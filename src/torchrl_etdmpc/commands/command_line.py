@@ -200,6 +200,14 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
     for name, setting in settings.items():
         if setting.default is dataclasses.MISSING and name not in given and not {"--cfg", "-c"} & set(flags):
             raise ValueError(f"{name}=... is missing: {setting.meaning[0].lower()}{setting.meaning[1:]}")
+    values = dict(argument.split("=", 1) for argument in checked)
+    fixed = "${" not in values.get("run_dir", "${")
+    several = any("," in re.sub(r"\[.*?\]|\(.*?\)", "", value) for name, value in values.items() if name != "run_dir")
+    if sweep and fixed and several:
+        raise ValueError(
+            f"run_dir={values['run_dir']} would be that of every run; leave it out, or put what differs into it, e.g. "
+            "run_dir='runs/${seed}'."
+        )
     return flags + checked  # Hydra takes no flag between settings
 
 
