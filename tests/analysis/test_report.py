@@ -80,7 +80,8 @@ def test_a_report_is_exactly_its_files_and_nothing_is_left_beside_it(report):
 def test_figures_are_pictures(report):
     for name in FIGURES:
         assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-        assert Image.open(report / f"{name}.png").mode == "P"  # a third of the bytes
+        with Image.open(report / f"{name}.png") as picture:
+            assert picture.mode == "P"  # a third of the bytes
         assert b"<svg" in (report / f"{name}.svg").read_bytes()
 
 
