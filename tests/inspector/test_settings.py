@@ -38,6 +38,17 @@ def test_a_new_argument_of_a_subclass_appears_by_itself_and_can_be_changed():
     assert (changed.greed, changed.horizon, planner.greed) == (0.75, 2, 0.25)
 
 
+def test_an_argument_that_is_not_keyword_only_is_kept_too():
+    class Positional(EnsembleMPPIPlanner):
+        def __init__(self, env: LatentEnv, greed: float = 0.5, **kwargs) -> None:
+            super().__init__(env, **kwargs)
+            self.greed = greed
+
+    changed = with_settings(Positional(LatentEnv(LineWorld()), 0.9), beta=1.0)
+    assert (changed.greed, changed.score.beta) == (0.9, 1.0)
+    assert "env" not in settings_of_class(Positional)
+
+
 @pytest.mark.parametrize(
     "settings",
     [

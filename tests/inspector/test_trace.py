@@ -1,16 +1,18 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 import torch
 
 from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
-from torchrl_etdmpc.inspector import Cancelled, Trace, TraceError, add_simulation, load_trace, trace_plan
+from torchrl_etdmpc.inspector import Cancelled, TraceError, add_simulation, load_trace, trace_plan
 from torchrl_etdmpc.inspector.trace import principal_components
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
@@ -161,6 +163,33 @@ def test_when_no_score_is_finite_the_policy_is_chosen():
     assert np.array_equal(trace["action"], plan_of(planner, explore=False).action[0].numpy())
 
 
+class Diverging(LineWorld):
+    """A world in which some actions lead nowhere."""
+
+    def next(self, latent, action):
+        following = super().next(latent, action)
+        return torch.where(action[..., :1] > 0.9, torch.nan, following)
+
+
+def test_candidates_that_diverge_leave_the_others_where_they_are():
+    trace = trace_plan(make(Diverging(num_dynamics=2)), torch.tensor([0.25]))
+    there = np.isfinite(trace["points"]).all((2, 3, 4))
+    assert there.any() and not there.all()
+    assert np.array_equal(there, np.isfinite(trace["scores"]))
+    assert np.isfinite(trace["basis"]).all() and np.isfinite(trace["centre"]).all()
+    assert trace["explained"].sum() == pytest.approx(1, abs=1e-5)  # of a line, by two components
+
+
+def test_a_model_that_diverged_is_inspected_all_the_same():
+    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
+    for parameter in model.parameters():
+        torch.nn.init.constant_(parameter, torch.nan)
+    trace = trace_plan(make(model), OBSERVATION)
+    assert trace.manifest["fallback"]
+    assert np.isnan(trace["points"]).all()
+    assert not trace["explained"].any()
+
+
 def test_tracing_leaves_planner_and_random_state_alone():
     planner = make()
     before, state = {name: value for name, value in vars(planner).items()}, torch.get_rng_state()
@@ -189,6 +218,7 @@ def test_a_warm_start_of_another_horizon_is_cut_or_goes_on_with_zeros():
     assert trace_plan(make(horizon=2), OBSERVATION, plan_mean=carried)["warm_start"][:, 0].tolist() == [0.5, 0]
     cold = trace_plan(make(warm_start=False), OBSERVATION, plan_mean=carried)
     assert not cold["warm_start"].any()
+    assert trace_plan(make(initial="policy"), OBSERVATION, plan_mean=carried).get("warm_start") is None
 
 
 @pytest.mark.parametrize(
@@ -277,6 +307,26 @@ def text(manifest, arrays):
     arrays["value"] = np.array("high")
 
 
+def state_of_text(manifest, arrays):
+    manifest["state"] = "x"
+
+
+def nobody(manifest, arrays):
+    arrays["elites"][0, 0] = 24
+
+
+def less_than_nobody(manifest, arrays):
+    arrays["chosen"] = np.array(-2)
+
+
+def half_a_candidate(manifest, arrays):
+    arrays["elites"] = arrays["elites"] + 0.5
+
+
+def counted_proposals(manifest, arrays):
+    arrays["proposals"] = np.full(24, 99)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -287,6 +337,11 @@ def text(manifest, arrays):
         (missing, "a trace needs the array 'mean', which is missing"),
         (unknown, "a trace has no array 'surprise'"),
         (text, "value of a trace must hold numbers, got <U4"),
+        (state_of_text, "is not a trace: state in its manifest must be names with values"),
+        (nobody, r"elites of a trace must be whole numbers in \[0, 23\], its candidates"),
+        (half_a_candidate, r"elites of a trace must be whole numbers in \[0, 23\], its candidates"),
+        (less_than_nobody, r"chosen of a trace must be whole numbers in \[-1, 23\], its candidates"),
+        (counted_proposals, "proposals of a trace must be true or false, got int64"),
     ],
 )
 def test_a_file_that_is_no_trace_of_this_format_is_one_line(tmp_path, change, message):
@@ -305,6 +360,24 @@ def test_a_file_that_is_no_archive_is_one_line(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(TraceError, match="is not a trace"):
         load_trace(path)
+
+
+def test_a_manifest_that_nests_without_end_is_one_line(tmp_path):
+    np.savez(tmp_path / "trace.npz", manifest=np.array("[" * 100_000))
+    with pytest.raises(TraceError, match="is not a trace"):
+        load_trace(tmp_path / "trace.npz")
+
+
+def test_an_array_that_promises_more_than_any_memory_holds_is_one_line(tmp_path):
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    manifest = io.BytesIO()
+    np.save(manifest, np.array(json.dumps(trace_plan(make(), OBSERVATION).manifest)))
+    with zipfile.ZipFile(tmp_path / "trace.npz", "w") as archive:
+        archive.writestr("manifest.npy", manifest.getvalue())
+        archive.writestr("mean.npy", header.getvalue())
+    with pytest.raises(TraceError, match="is not a trace"):
+        load_trace(tmp_path / "trace.npz")
 
 
 def test_code_in_a_file_is_not_run(tmp_path):
@@ -333,8 +406,3 @@ def test_a_trace_of_full_size_is_below_20_mb(tmp_path):
     frames = np.random.default_rng(0).integers(0, 256, (7, 160, 160, 3), dtype=np.uint8)  # worse than any picture
     full = dataclasses.replace(trace, arrays={**trace.arrays, "frames": frames})
     assert full.save(tmp_path / "trace.npz").stat().st_size < 20e6
-
-
-def test_load_is_also_a_method(tmp_path):
-    trace = trace_plan(make(), OBSERVATION)
-    assert Trace.load(trace.save(tmp_path / "trace.npz")).manifest == trace.manifest

@@ -124,15 +124,15 @@ def _plain(value: Any) -> Any:
 
 
 def _arguments(planner_class: type) -> dict[str, tuple[inspect.Parameter, Any]]:
-    """Keyword arguments with their types, those that ``**kwargs`` hands on to a base included."""
+    """Arguments behind the environment with their types, those that ``**kwargs`` hands on to a base included."""
     found: dict[str, tuple[inspect.Parameter, Any]] = {}
     for base in planner_class.__mro__:
         if "__init__" not in vars(base):
             continue
         hints = typing.get_type_hints(vars(base)["__init__"])
-        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
-        for parameter in parameters:
-            if parameter.kind is parameter.KEYWORD_ONLY:
+        parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())
+        for parameter in parameters[2:]:  # without self and env
+            if parameter.kind in (parameter.KEYWORD_ONLY, parameter.POSITIONAL_OR_KEYWORD):
                 found.setdefault(parameter.name, (parameter, hints.get(parameter.name, type(parameter.default))))
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             break

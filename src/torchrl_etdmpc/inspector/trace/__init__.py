@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_etdmpc.inspector.trace.latents import principal_components
+from torchrl_etdmpc.inspector.trace.latents import head_spread, principal_components, rolled_out
 from torchrl_etdmpc.inspector.trace.planning import trace_plan
 from torchrl_etdmpc.inspector.trace.progress import Cancelled, watched
 from torchrl_etdmpc.inspector.trace.simulation import add_simulation
@@ -14,8 +14,10 @@ __all__ = [
     "TraceError",
     "add_simulation",
     "checksum",
+    "head_spread",
     "load_trace",
     "principal_components",
+    "rolled_out",
     "trace_plan",
     "watched",
 ]

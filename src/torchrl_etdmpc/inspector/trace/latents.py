@@ -27,15 +27,27 @@ class Components(NamedTuple):
         """``[..., L]`` to ``[..., C]``."""
         return (latents - self.centre) @ self.basis.mT
 
+    def shares(self, *parts: Tensor) -> Tensor:
+        """Which share of the variance of latents ``[..., L]`` each shows, ``[C]``; of those that are finite."""
+        shown, total = self.basis.new_zeros(len(self.basis)), self.basis.new_zeros(())
+        for latents in parts:
+            finite = latents[latents.isfinite().all(-1)]
+            shown = shown + self.project(finite).square().sum(0)
+            total = total + (finite - self.centre).square().sum()
+        return shown / total.clamp_min(1e-30)
+
 
 def principal_components(latents: Tensor) -> Components:
-    """The components of rows ``[M, L]``, at most three.
+    """The components of rows ``[M, L]``, at most three; of those that are finite.
 
     >>> components = principal_components(torch.tensor([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]]))
     >>> components.project(torch.tensor([2.0, 2.0])).abs().max().item() < 1e-6
     True
     """
     rows = latents[:: math.ceil(len(latents) / _BASIS_ROWS)].double()
+    rows = rows[rows.isfinite().all(-1)]
+    if not len(rows):  # everything is drawn at no place, which a figure leaves out
+        rows = latents.new_zeros(1, latents.shape[-1]).double()
     centre = rows.mean(0)
     _, vectors = torch.linalg.eigh((rows - centre).mT @ (rows - centre))  # in ascending order
     basis = vectors.mT.flip(0)[:COMPONENTS]
@@ -45,11 +57,11 @@ def principal_components(latents: Tensor) -> Components:
 
 
 def rolled_out(model: PredictionModel, latent: Tensor, actions: Tensor) -> Tensor:
-    """Latents ``[H, F, N, L]`` along sequences ``[N, H, A]``, every head on its own rollout."""
-    before, latents = latent[None, None, None], []
-    for step in range(actions.shape[1]):
-        before = model.next(before, actions[None, :, step])
-        latents.append(before[:, 0])
+    """Latents ``[H, F, ..., N, L]`` along sequences ``[..., N, H, A]`` from ``[..., L]``, every head on its own."""
+    before, latents = latent[None, ..., None, :], []
+    for step in range(actions.shape[-2]):
+        before = model.next(before, actions[..., step, :])
+        latents.append(before)
     return torch.stack(latents)
 
 
@@ -62,24 +74,26 @@ def latent_views(
     else:
         components = Components(*(torch.from_numpy(like[name]).to(start) for name in ("centre", "basis")))
     points = torch.stack([components.project(latents).permute(2, 0, 1, 3) for latents in rolled])
-    spread = torch.stack([_spread(latents).mT for latents in rolled])
-    total = sum((latents - components.centre).square().sum() for latents in rolled)
+    spread = torch.stack([head_spread(latents).mT for latents in rolled])
     return components, {
         **components._asdict(),
-        "explained": points.square().sum((0, 1, 2, 3)) / torch.as_tensor(total).clamp_min(1e-30),
+        "explained": components.shares(*rolled),
         "start_point": components.project(start),
         "points": points,
         "latent_spread": spread,
     }
 
 
-def _spread(latents: Tensor) -> Tensor:
-    """Root mean square distance ``[H, N]`` of the heads' latents ``[H, F, N, L]`` from their mean.
+def head_spread(latents: Tensor) -> Tensor:
+    """Root mean square distance ``[..., N]`` of the heads' latents ``[..., F, N, L]`` from their mean.
 
     By hand: on a CPU, ``Tensor.std`` over a dimension that is not the last takes longer than all of the planning.
+
+    >>> head_spread(torch.tensor([[[1.0, 2.0]], [[1.0, 4.0]]]))  # two heads, one latent
+    tensor([1.])
     """
-    apart = latents - latents.mean(1, keepdim=True)
-    return apart.square().sum(-1).mean(1).sqrt()
+    apart = latents - latents.mean(-3, keepdim=True)
+    return apart.square().sum(-1).mean(-2).sqrt()
 
 
 def candidate_latents(

@@ -92,12 +92,13 @@ def trace_plan(
         "elite_weights": weights,
         "proposals": proposals,
         "latent": latent,
-        "warm_start": shift_plan(carried),
         "action": plan.action[0],
         "scale": plan.scale[0],
         "value": plan.value[0],
         "chosen": torch.tensor(chosen),
     }
+    if planner.initial == "wide":  # "policy" does not read it
+        tensors["warm_start"] = shift_plan(carried)
     if isinstance(observation, Tensor) and observation.ndim == 1:
         tensors["observation"] = observation
     if isinstance(planner.score, AdaptiveScore):

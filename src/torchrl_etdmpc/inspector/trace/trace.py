@@ -25,6 +25,11 @@ KIND = "torchrl_etdmpc trace"
 COMPONENTS = 3
 versions = functools.cache(library_versions)  # which looks into files
 _MOST_BYTES = 2**30  # of a trace in memory
+# What is not there, is cut off, or was made to take all memory or to nest without end.
+_UNREADABLE = (
+    *(OSError, ValueError, KeyError, zipfile.BadZipFile, DamagedFileError, EOFError),
+    *(MemoryError, RecursionError),
+)
 
 
 # The arrays of a trace and their dimensions, by the alphabet of the package; C principal components, S states along
@@ -98,7 +103,8 @@ class Trace:
                                           on, ``policy_scores [F]`` and ``policy_returns [F, D, F, V]``
     ``real_rewards [R]``                  the chosen sequence in the simulator, with ``real_points [R + 1, C]`` and
                                           ``frames [R + 1, height, width, 3]``
-    ``latent [L], observation [O]``       where it began, and ``warm_start [H, A]`` the Gaussian's first mean
+    ``latent [L], observation [O]``       where it began, and ``warm_start [H, A]`` the Gaussian's first mean, with
+                                          ``initial="wide"``
     ====================================  ======================================================================
 
     Args:
@@ -107,7 +113,7 @@ class Trace:
         arrays (mapping of str to ndarray): some of the above.
 
     Raises:
-        TraceError: if an array is missing, has another shape or is unknown.
+        TraceError: if an array is missing, has another shape, names no candidate or is unknown.
 
     >>> from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
     >>> from torchrl_etdmpc.inspector import trace_plan
@@ -142,6 +148,12 @@ class Trace:
                 raise TraceError(f"{name} of a trace must have shape {want}, got {list(array.shape)}.")
             if array.dtype.kind not in "biuf":
                 raise TraceError(f"{name} of a trace must hold numbers, got {array.dtype}.")
+        for name, least in (("elites", 0), ("chosen", -1)):
+            array, most = self[name], sizes["N"] - 1
+            if array.dtype.kind not in "iu" or array.size and not least <= array.min() <= array.max() <= most:
+                raise TraceError(f"{name} of a trace must be whole numbers in [{least}, {most}], its candidates.")
+        if self["proposals"].dtype.kind != "b":
+            raise TraceError(f"proposals of a trace must be true or false, got {self['proposals'].dtype}.")
 
     def _size(self, name: str, dimension: int, default: int) -> int:
         array = self.arrays.get(name)
@@ -196,11 +208,6 @@ class Trace:
         write_whole(path, memory.getvalue())
         return path
 
-    @staticmethod
-    def load(path: str | Path) -> Trace:
-        """:func:`load_trace`."""
-        return load_trace(path)
-
 
 def load_trace(path: str | Path) -> Trace:
     """Reads a file of :meth:`Trace.save`; no code in it is run.
@@ -234,12 +241,15 @@ def load_trace(path: str | Path) -> Trace:
                     "torchrl_etdmpc that wrote it, or a newer one."
                 )
             arrays = {name: stored[name] for name in stored.files if name != "manifest"}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, DamagedFileError, EOFError) as error:
+    except _UNREADABLE as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise TraceError(f"{path} is not a trace ({reason}); write one with Trace.save.") from error
     missing = {"settings", "planner", "state"} - manifest.keys()
     if missing:
         raise TraceError(f"{path} is not a whole trace: its manifest lacks {', '.join(sorted(missing))}.")
+    wrong = [name for name in ("settings", "state") if not isinstance(manifest[name], dict)]
+    if wrong:
+        raise TraceError(f"{path} is not a trace: {wrong[0]} in its manifest must be names with values.")
     try:
         return Trace(manifest, arrays)
     except TraceError as error:
