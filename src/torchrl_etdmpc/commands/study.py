@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import importlib
 import importlib.util
 import io
@@ -26,6 +25,7 @@ from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
 from torchrl_etdmpc.inspector.studies import choose_states
+from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.runs import first_line, library_versions, progress_bar, replacing
 from torchrl_etdmpc.runs.files import write_whole
@@ -102,7 +102,7 @@ def _main(config: StudyConfig) -> None:
     about = {
         "task": task.name,
         "checkpoint": config.checkpoint,
-        "checkpoint_sha256": hashlib.sha256(Path(config.checkpoint).expanduser().read_bytes()).hexdigest(),
+        "checkpoint_sha256": checksum(config.checkpoint),
         "trained_env_steps": counters["env_steps"],
         "episodes": config.episodes,
         "mean_return": returns.mean().item(),
@@ -143,7 +143,7 @@ def _study(
     simulator: Simulator,
     config: StudyConfig,
 ) -> Any:
-    """The study's result, from states that have as many decisions after them as it looks ahead."""
+    """The study's result, from states that have as many decisions after them as it looks ahead, or the task's end."""
     # Of the episodes that were played, which may have ended before their time limit.
     decisions = round(sum(len(episode.reward) for episode in episodes) / len(episodes))
     window = max(min(50, decisions // 2), 1)

@@ -35,6 +35,13 @@ class WorldSimulator:
         return Rolled(torch.stack(observations), torch.stack(rewards), None, False)
 
 
+class EndingSimulator(WorldSimulator):
+    """The same, where the task ends with the second action."""
+
+    def roll(self, actions: Tensor) -> Rolled:
+        return super().roll(actions[:2])._replace(terminated=True)
+
+
 def make_planner(world: AnalyticWorld, **settings: object) -> EnsembleMPPIPlanner:
     """A planner that finds the best plan of a small world."""
     budget = {"horizon": 3, "num_samples": 256, "num_elites": 32, "num_proposals": 4, "iterations": 6}
@@ -79,6 +86,11 @@ def _seeded() -> None:
 @pytest.fixture(name="WorldSimulator")
 def world_simulator() -> type[WorldSimulator]:
     return WorldSimulator
+
+
+@pytest.fixture(name="EndingSimulator")
+def ending_simulator() -> type[EndingSimulator]:
+    return EndingSimulator
 
 
 @pytest.fixture(name="make_planner")

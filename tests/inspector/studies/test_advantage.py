@@ -51,3 +51,10 @@ def test_nothing_is_gained_over_an_optimal_policy(measure):
 def test_the_planner_acts_within_the_horizon(measure):
     with pytest.raises(ValueError, match=r"steps must be in 1..horizon=5, got 6"):
         measure(LineWorld(), 6)
+
+
+def test_the_median_of_an_even_number_lies_in_the_middle():
+    earned = torch.tensor([0.0, 1.0, 3.0, 100.0])
+    result = advantage.Advantage(earned, torch.zeros(4), torch.zeros(4, 2), 1, 2, torch.arange(4))
+    (row,) = advantage.table(result)
+    assert row["median"] == 2.0

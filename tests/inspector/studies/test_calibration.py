@@ -65,3 +65,31 @@ def test_one_head_is_refused(make_episodes, make_planner, WorldSimulator):
     states = choose_states(make_episodes(world, torch.zeros_like), 4, ahead=2)
     with pytest.raises(ValueError, match="num_dynamics must be at least 2 for heads to disagree, got 1"):
         calibration.calibration(make_planner(world), states, WorldSimulator(world))
+
+
+def test_what_lies_behind_the_end_of_the_task_is_no_error(make_episodes, make_planner, EndingSimulator):
+    world = Unsure(num_dynamics=2, policy_gain=1.0)
+    world.wrong, world.apart = 0.3, 0.1
+    states = choose_states(make_episodes(world, torch.zeros_like, count=20, steps=4), 20, ahead=4)
+    planner = make_planner(world, num_samples=16, num_elites=4, iterations=1)
+    result = calibration.calibration(planner, states, EndingSimulator(world), horizon=4)
+    for field in (result.error, result.disagreement):
+        assert field[..., :2].isfinite().all()
+        assert field[..., 2:].isnan().all()
+    rows = calibration.table(result)
+    assert [row["states"] for row in rows] == 2 * [20, 20, 0, 0]
+    calibration.figure(result)
+    for field in (result.error, result.disagreement):
+        field[5:, :, 0] = torch.nan
+        field[:5, :, 0] = torch.arange(5.0).unsqueeze(1)
+    first = calibration.table(result)[0]
+    found = [first[name] for name in ("error", "disagreement", "error_over_disagreement", "rank_correlation")]
+    assert found == pytest.approx([2, 2, 1, 1])
+
+
+def test_pairs_that_are_not_there_change_no_rank():
+    torch.manual_seed(0)
+    pairs = torch.randn(30, 2)
+    pairs[::3, 1] = torch.nan
+    expected = spearmanr(*pairs[~pairs[:, 1].isnan()].T).statistic
+    assert calibration.rank_correlation(pairs).item() == pytest.approx(expected)

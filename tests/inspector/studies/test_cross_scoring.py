@@ -48,3 +48,10 @@ def test_the_table_has_an_interval_around_every_gain():
     assert all(row["low"] < row["gain"] < row["high"] for row in rows)
     bars = [bar.get_height() for bar in cross_scoring.figure(result).axes[0].patches]
     assert sorted(bars) == pytest.approx(sorted(row["gain"] for row in rows))
+
+
+def test_the_median_of_an_even_number_lies_in_the_middle():
+    returns = torch.zeros(4, 3, 3)
+    returns[:, :2] = torch.tensor([0.0, 1.0, 3.0, 100.0]).view(4, 1, 1)
+    rows = cross_scoring.table(cross_scoring.CrossScores(returns, 1.0, torch.arange(4)))
+    assert {row["median"] for row in rows} == {2.0}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pytest
 import torch
 
 from torchrl_etdmpc.functional import adaptive_mixture
@@ -49,3 +50,15 @@ def test_the_table_names_every_weight_and_the_lines_the_mean_depth():
     ]
     shown = horizon_weights.figure(result).axes[0].images[0].get_array()
     assert shown.tolist() == weights[0, 0].tolist()
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_candidate_that_diverged_is_no_elite(make_episodes, make_planner, bad):
+    class Patchy(LineWorld):
+        def reward(self, latent, action):
+            return torch.where(action[..., 0].abs() > 0.6, bad, super().reward(latent, action))
+
+    world = Patchy(num_values=2, value_offset=[APART, -APART], policy_gain=1.0)
+    states = choose_states(make_episodes(world, torch.zeros_like), 4)
+    result = horizon_weights.horizon_weights(make_planner(world), states, betas=(1.0,), horizon=3)
+    assert all(field.isfinite().all() for field in (result.weights, result.mean, result.sigma))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pytest
 import torch
 
 from torchrl_etdmpc.inspector.studies import choose_states, latent_gallery
@@ -54,3 +55,18 @@ def test_one_head_has_no_spread_to_speak_of(make_episodes, make_planner, WorldSi
     (text,) = latent_gallery.lines(result)
     assert text.startswith("true return of the whole plan, beta 10 minus beta 0: ")
     assert len(latent_gallery.figure(result).axes) == 2 * latent_gallery.SHOWN
+
+
+def test_what_lies_behind_the_end_of_the_task_is_no_error(make_episodes, make_planner, WorldSimulator, EndingSimulator):
+    world = LineWorld(num_dynamics=2, drift=[[0.1], [-0.1]], policy_gain=1.0)
+    states = choose_states(make_episodes(world, world.optimal_action), 5, ahead=4)
+    result = latent_gallery.latent_gallery(make_planner(world), states, EndingSimulator(world), horizon=4)
+    assert torch.allclose(result.error[..., :2], torch.zeros(5, 2, 2), atol=1e-5)
+    assert result.error[..., 2:].isnan().all()
+    assert result.true_returns.isfinite().all()
+    latent_gallery.figure(result)
+    whole = latent_gallery.latent_gallery(make_planner(world), states, WorldSimulator(world), horizon=4)
+    true = whole.true + 1
+    true[1:, :, 3:] = torch.nan  # all but one ended
+    rows = latent_gallery.table(whole._replace(true=true))
+    assert [row["error"] for row in rows] == pytest.approx([2**0.5] * 8, rel=1e-4)

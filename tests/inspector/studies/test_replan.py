@@ -72,3 +72,29 @@ def test_components_are_those_of_the_largest_spread():
     assert abs(torch.corrcoef(torch.stack([coordinates[..., 0].flatten(), centred[:, 0]]))[0, 1]) > 0.99
     assert float(shares.sum()) == pytest.approx(1)
     assert shares[0] > shares[1]
+
+
+def test_a_planner_without_a_warm_start_is_given_none(make_planner):
+    planner = make_planner(LineWorld(policy_gain=1.0), warm_start=False)
+    observation, carried = torch.zeros(2, 1), torch.full((2, 3, 1), 0.9)
+    plans = [replan(planner, observation, warm, generator=generator_of(planner, 0)) for warm in (carried, None)]
+    assert torch.equal(plans[0].mean, plans[1].mean)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_score_that_is_not_finite_is_never_the_best(make_planner, bad):
+    planner = make_planner(Patchy(bad))
+    plan = replan(planner, torch.zeros(3, 1), generator=generator_of(planner, 0), trace=True)
+    assert not plan.trace.scores[:, -1].isfinite().all()
+    assert torch.equal(best_sequences(plan)[:, 0], plan.action)
+
+
+class Patchy(LineWorld):
+    """A world whose reward is bad where actions are large."""
+
+    def __init__(self, bad: float) -> None:
+        super().__init__(policy_gain=1.0)
+        self.bad = bad
+
+    def reward(self, latent, action):
+        return torch.where(action[..., 0].abs() > 0.6, self.bad, super().reward(latent, action))

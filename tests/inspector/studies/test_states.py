@@ -3,7 +3,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_etdmpc.inspector import Rolled
 from torchrl_etdmpc.inspector.studies.states import choose_states, episode_interval, roll_all
 from torchrl_etdmpc.testing import LineWorld
 
@@ -27,6 +26,13 @@ def test_all_states_are_taken_where_there_are_not_enough(make_episodes):
     episodes = make_episodes(LineWorld(), torch.zeros_like, count=2, steps=5)
     assert len(choose_states(episodes, 100, ahead=2).step) == 2 * 4
     assert len(choose_states(episodes, 100).step) == 2 * 5  # of every decision
+
+
+def test_every_decision_counts_of_an_episode_that_ended_its_task(make_episodes):
+    cut, ended = make_episodes(LineWorld(), torch.zeros_like, count=2, steps=5)
+    states = choose_states([cut, ended._replace(terminated=True)], 100, ahead=3)
+    assert states.step[states.episode == 0].tolist() == [0, 1, 2]
+    assert states.step[states.episode == 1].tolist() == [0, 1, 2, 3, 4]
 
 
 def test_no_states_are_an_error(make_episodes):
@@ -61,18 +67,15 @@ def test_intervals_take_any_shape_and_statistic():
     assert (largest.low <= largest.high).all()
 
 
-def test_nothing_is_earned_after_the_end(make_episodes, WorldSimulator):
-    class Ends(WorldSimulator):
-        def roll(self, actions):
-            return Rolled(*super().roll(actions[:2])[:3], terminated=True)
-
+def test_nothing_is_earned_or_observed_after_the_end(make_episodes, WorldSimulator, EndingSimulator):
     world = LineWorld()
     states = choose_states(make_episodes(world, torch.zeros_like), 3, ahead=4)
-    observation, reward, alive = roll_all(Ends(world), states, torch.ones(3, 4, 1))
+    observation, reward, alive = roll_all(EndingSimulator(world), states, torch.ones(3, 4, 1))
     assert torch.equal(alive, torch.tensor([[True, True, False, False, False]]).expand(3, -1))
     assert reward[:, :2].abs().min() > 0
     assert not reward[:, 2:].any()
-    assert torch.equal(observation[:, 2:], observation[:, 2:3].expand(-1, 3, -1))
+    assert observation[:, :3].isfinite().all()
+    assert observation[:, 3:].isnan().all()
     whole, _, lives = roll_all(WorldSimulator(world), states, torch.ones(3, 4, 1))
     assert lives.all()
     assert torch.allclose(whole[:, -1] - whole[:, 0], torch.tensor(2.0))

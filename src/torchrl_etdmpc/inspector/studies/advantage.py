@@ -93,7 +93,7 @@ def table(result: Advantage) -> list[dict[str, Any]]:
             "difference": interval.value.item(),
             "low": interval.low.item(),
             "high": interval.high.item(),
-            "median": result.difference.median().item(),
+            "median": result.difference.quantile(0.5).item(),
             "planner_better": (result.difference > 0).double().mean().item(),
             "policy_better": (result.difference < 0).double().mean().item(),
             "mean_policy": result.policy.mean().item(),

@@ -16,6 +16,7 @@ from torchrl_etdmpc.inspector.studies.replan import (
     replan,
 )
 from torchrl_etdmpc.inspector.studies.states import States, TrueWorld, episode_interval, roll_all
+from torchrl_etdmpc.inspector.trace import head_spread
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 
 ACTIONS = ("planned", "random")
@@ -27,7 +28,7 @@ class Calibration(NamedTuple):
     disagreement: Tensor
     """Root mean squared distance of the heads from their mean, in latent space, ``[S, 2, H]``; by ``ACTIONS``."""
     error: Tensor
-    """Distance of their mean from the encoded truth, ``[S, 2, H]``."""
+    """Distance of their mean from the encoded truth, ``[S, 2, H]``; after the end of the task both are NaN."""
     episode: Tensor
     """``[S]``"""
 
@@ -65,21 +66,26 @@ def calibration(
     for actions in (planned, random):
         heads = imagine(planner, states.observation, actions)[:, :, 1:]
         true = encode(planner, roll_all(simulator, states, actions)[0][:, 1:])
-        said.append((heads - heads.mean(1, keepdim=True)).square().sum(-1).mean(1).sqrt())
         was.append((heads.mean(1) - true).norm(dim=-1))
+        said.append(head_spread(heads).where(~was[-1].isnan(), torch.nan))
     return Calibration(torch.stack(said, dim=1), torch.stack(was, dim=1), states.episode)
 
 
 def rank_correlation(pairs: Tensor) -> Tensor:
     """Spearman's rank correlation of pairs ``[S, ..., 2]``, ``[...]``; 0 where one of them does not vary.
 
+    Pairs of NaN are left out.
+
     >>> rank_correlation(torch.tensor([[1.0, 10.0], [2.0, 30.0], [3.0, 20.0]])).item()
     0.5
     """
     rows = pairs.movedim(0, -1).contiguous()
+    missing = rows.isnan().any(-2, keepdim=True)
+    rows = rows.where(~missing, torch.inf)  # behind all others, whose ranks stay what they are
     ordered = rows.sort(-1).values
     ranks = torch.searchsorted(ordered, rows) + torch.searchsorted(ordered, rows, right=True)  # ties share their middle
-    ranks = ranks.double() - ranks.double().mean(-1, keepdim=True)
+    ranks = ranks.double().where(~missing, torch.nan)
+    ranks = (ranks - ranks.nanmean(-1, keepdim=True)).nan_to_num(0)
     one, other = ranks.unbind(-2)
     norm = (one.square().sum(-1) * other.square().sum(-1)).sqrt()
     return torch.where(norm > 0, (one * other).sum(-1) / norm.clamp_min(1e-12), torch.zeros_like(norm))
@@ -89,7 +95,7 @@ def table(result: Calibration) -> list[dict[str, Any]]:
     """Rank correlation with its interval, and the ratio of error and disagreement, by kind of action and depth."""
     pairs = torch.stack([result.disagreement, result.error], dim=-1)
     correlation = episode_interval(pairs, result.episode, rank_correlation, resamples=400)
-    ratio = episode_interval(pairs, result.episode, lambda rows: rows[..., 1].mean(0) / rows[..., 0].mean(0))
+    ratio = episode_interval(pairs, result.episode, lambda rows: rows[..., 1].nanmean(0) / rows[..., 0].nanmean(0))
     return [
         {
             "actions": kind,
@@ -97,12 +103,12 @@ def table(result: Calibration) -> list[dict[str, Any]]:
             "rank_correlation": correlation.value[row, depth].item(),
             "low": correlation.low[row, depth].item(),
             "high": correlation.high[row, depth].item(),
-            "disagreement": result.disagreement[:, row, depth].mean().item(),
-            "error": result.error[:, row, depth].mean().item(),
+            "disagreement": result.disagreement[:, row, depth].nanmean().item(),
+            "error": result.error[:, row, depth].nanmean().item(),
             "error_over_disagreement": ratio.value[row, depth].item(),
             "ratio_low": ratio.low[row, depth].item(),
             "ratio_high": ratio.high[row, depth].item(),
-            "states": len(result.episode),
+            "states": int((~result.error[:, row, depth].isnan()).sum()),
         }
         for row, kind in enumerate(ACTIONS)
         for depth in range(result.error.shape[-1])

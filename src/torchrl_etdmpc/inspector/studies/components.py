@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
+
+from torchrl_etdmpc.inspector.trace import principal_components
 
 
 def components(points: Tensor) -> tuple[Tensor, Tensor]:
     """First two principal components of points ``[..., L]``: coordinates ``[..., 2]`` and shares of the variance.
 
+    >>> import torch
     >>> coordinates, shares = components(torch.tensor([[3.0, 4.0], [-3.0, -4.0]]))
-    >>> coordinates[:, 0].abs().tolist(), shares[0].item()
-    ([5.0, 5.0], 1.0)
+    >>> coordinates[:, 0].abs(), shares[0]
+    (tensor([5., 5.], dtype=torch.float64), tensor(1., dtype=torch.float64))
     """
-    flat = points.flatten(0, -2).double()
-    _, strengths, directions = torch.linalg.svd(flat - flat.mean(0), full_matrices=False)
-    shares = strengths.square() / strengths.square().sum().clamp_min(torch.finfo(flat.dtype).tiny)
-    return (points.double() - flat.mean(0)) @ directions[:2].mT, shares[:2]
+    points = points.double()
+    found = principal_components(points.flatten(0, -2))
+    return found.project(points)[..., :2], found.shares(points)[:2]

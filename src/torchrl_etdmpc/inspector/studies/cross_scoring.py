@@ -105,7 +105,7 @@ def table(result: CrossScores) -> list[dict[str, Any]]:
             "gain": interval.value[row, column].item(),
             "low": interval.low[row, column].item(),
             "high": interval.high[row, column].item(),
-            "median": result.gain[:, row, column].median().item(),
+            "median": result.gain[:, row, column].quantile(0.5).item(),
             "standard_error_over_states": error[row, column].item(),
             "states": len(result.gain),
         }

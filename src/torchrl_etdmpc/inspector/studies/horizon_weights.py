@@ -53,7 +53,8 @@ def horizon_weights(
         searcher = with_settings(planner, horizon=horizon, score="adaptive", beta=float(beta))
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         assert plan.trace is not None
-        elites = plan.trace.scores.topk(searcher.num_elites, dim=-1).indices[..., None]
+        ranked = plan.trace.scores.where(plan.trace.scores.isfinite(), -torch.inf)
+        elites = ranked.topk(searcher.num_elites, dim=-1).indices[..., None]
         mean, sigma = ensemble_mean(plan.trace.returns), ensemble_variance(plan.trace.returns).sqrt()
         mean, sigma = (part.gather(2, elites.expand(-1, -1, -1, horizon)) for part in (mean, sigma))  # [S, I, K, H]
         _, weights = adaptive_mixture(mean, sigma, float(beta))

@@ -21,6 +21,7 @@ from torchrl_etdmpc.inspector.studies.replan import (
     true_returns,
 )
 from torchrl_etdmpc.inspector.studies.states import States, TrueWorld, episode_interval, roll_all
+from torchrl_etdmpc.inspector.trace import head_spread
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 
 SHOWN = 4  # states of the figure
@@ -32,7 +33,7 @@ class LatentGallery(NamedTuple):
     imagined: Tensor
     """Latents of each head, ``[S, b, F, H + 1, L]``."""
     true: Tensor
-    """The encoded observations of the simulator, ``[S, b, H + 1, L]``."""
+    """The encoded observations of the simulator, ``[S, b, H + 1, L]``; NaN after the end of the task."""
     returns: Tensor
     """Return table, ``[S, b, H, F, V]``."""
     true_returns: Tensor
@@ -44,8 +45,7 @@ class LatentGallery(NamedTuple):
     @property
     def spread(self) -> Tensor:
         """Root mean squared distance of the heads from their mean, in latent space, ``[S, b, H]``."""
-        heads = self.imagined[:, :, :, 1:]
-        return (heads - heads.mean(2, keepdim=True)).square().sum(-1).mean(2).sqrt()
+        return head_spread(self.imagined[:, :, :, 1:])
 
     @property
     def deviation(self) -> Tensor:
@@ -54,7 +54,7 @@ class LatentGallery(NamedTuple):
 
     @property
     def error(self) -> Tensor:
-        """Distance of the heads' mean from the truth, ``[S, b, H]``."""
+        """Distance of the heads' mean from the truth, ``[S, b, H]``; NaN after the end of the task."""
         return (self.imagined[:, :, :, 1:].mean(2) - self.true[:, :, 1:]).norm(dim=-1)
 
 
@@ -107,7 +107,9 @@ def table(result: LatentGallery) -> list[dict[str, Any]]:
         "estimated_return": result.returns.mean((-2, -1)),
         "true_return": result.true_returns,
     }
-    intervals = {name: episode_interval(values, result.episode) for name, values in columns.items()}
+    intervals = {
+        name: episode_interval(values, result.episode, lambda rows: rows.nanmean(0)) for name, values in columns.items()
+    }
     for number, beta in enumerate(result.betas):
         for depth in range(result.true_returns.shape[-1]):
             row: dict[str, Any] = {"beta": beta, "depth": depth + 1, "states": len(result.episode)}

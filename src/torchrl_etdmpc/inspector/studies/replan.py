@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.inspector.trace import rolled_out
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, Plan, PlanTrace
 from torchrl_etdmpc.planners.imagination import imagined_returns
 
@@ -39,13 +40,13 @@ def replan(
     generator: torch.Generator,
     trace: bool = False,
 ) -> Plan:
-    """Plans without exploration for observations ``[S, O]``, from warm starts ``[S, H, A]``."""
+    """Plans without exploration for observations ``[S, O]``, from warm starts ``[S, H, A]`` if it has one."""
     device, _ = planner.env.device_and_dtype()
     parts = []
     for start in range(0, len(observation), _AT_ONCE):
         rows = slice(start, start + _AT_ONCE)
         states = observation[rows].to(device)
-        warm = None if plan_mean is None else plan_mean[rows].to(device)
+        warm = None if plan_mean is None or not planner.warm_start else plan_mean[rows].to(device)
         noise = planner.draw_noise(len(states), generator=generator)
         parts.append(planner.plan(states, warm, explore=False, noise=noise, trace=trace))
     joined = [torch.cat(fields).cpu() for fields in zip(*(part[:-1] for part in parts), strict=True)]
@@ -57,7 +58,8 @@ def replan(
 def best_sequences(plan: Plan) -> Tensor:
     """The candidate with the highest score of the last iteration, ``[S, H, A]``."""
     assert plan.trace is not None
-    best = plan.trace.scores[:, -1].nan_to_num(-torch.inf).argmax(-1)
+    scores = plan.trace.scores[:, -1]
+    best = scores.where(scores.isfinite(), -torch.inf).argmax(-1)
     return plan.trace.actions[torch.arange(len(best)), -1, best]
 
 
@@ -90,10 +92,9 @@ def values(planner: EnsembleMPPIPlanner, observation: Tensor) -> Tensor:
 def imagine(planner: EnsembleMPPIPlanner, observation: Tensor, actions: Tensor) -> Tensor:
     """Latents of every head on its own rollout, the first one included, ``[S, F, H + 1, L]``."""
     model, device = planner.world_model, planner.env.device_and_dtype()[0]
-    latents = [model.encode(observation.to(device)).expand(model.num_dynamics, -1, -1)]
-    for step in range(actions.shape[1]):
-        latents.append(model.next(latents[-1], actions[:, step].to(device)))
-    return torch.stack(latents, dim=2).transpose(0, 1).cpu()
+    start = model.encode(observation.to(device))
+    following = rolled_out(model, start, actions.unsqueeze(1).to(device)).squeeze(3)  # [H, F, S, L]
+    return torch.cat([start.expand(1, *following.shape[1:]), following]).permute(2, 1, 0, 3).cpu()
 
 
 @torch.no_grad()
@@ -119,4 +120,4 @@ def true_returns(planner: EnsembleMPPIPlanner, observation: Tensor, reward: Tens
     """
     powers = planner.discount ** torch.arange(reward.shape[1] + 1)
     earned = (reward * powers[:-1]).cumsum(1)
-    return earned + powers[1:] * values(planner, observation[:, 1:]) * alive[:, 1:]
+    return earned + powers[1:] * values(planner, observation[:, 1:]).where(alive[:, 1:], 0.0)

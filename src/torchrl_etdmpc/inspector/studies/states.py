@@ -63,7 +63,8 @@ def choose_states(episodes: Sequence[Episode], count: int, *, ahead: int = 0, se
         count (int): S.
 
     Keyword Args:
-        ahead (int): how many decisions have to follow a state in its episode. Default: 0.
+        ahead (int): how many decisions have to follow a state in an episode that was cut. Of one that ended its task
+            every decision counts: all that followed is known. Default: 0.
         seed (int): of the draw.
 
     Raises:
@@ -72,7 +73,7 @@ def choose_states(episodes: Sequence[Episode], count: int, *, ahead: int = 0, se
     places = [
         (number, step)
         for number, episode in enumerate(episodes)
-        for step in range(len(episode.reward) + 1 - max(ahead, 1))
+        for step in range(len(episode.reward) + 1 - max(0 if episode.terminated else ahead, 1))
     ]
     if count < 1 or not places:
         longest = max((len(episode.reward) for episode in episodes), default=0)
@@ -136,16 +137,16 @@ def roll_all(simulator: TrueWorld, states: States, actions: Tensor) -> tuple[Ten
 
     Returns:
         tuple of Tensor: observations ``[S, H + 1, O]``, rewards ``[S, H]``, and whether the task had not ended
-        ``[S, H + 1]``; after an end the last observation is repeated and nothing is earned.
+        ``[S, H + 1]``; after an end nothing is observed, which is NaN, and nothing is earned.
     """
     size, horizon = actions.shape[:2]
-    observation = states.observation.unsqueeze(1).repeat(1, horizon + 1, 1)
+    observation = torch.full((size, horizon + 1, states.observation.shape[-1]), torch.nan)
     reward, alive = torch.zeros(size, horizon), torch.ones(size, horizon + 1, dtype=torch.bool)
     for index, state in enumerate(states.simulator):
         simulator.restore(state)
         rolled = simulator.roll(actions[index])
         steps = len(rolled.reward)
-        observation[index, : steps + 1], observation[index, steps + 1 :] = rolled.observation, rolled.observation[-1]
+        observation[index, : steps + 1] = rolled.observation
         reward[index, :steps] = rolled.reward
         alive[index, steps + (0 if rolled.terminated else 1) :] = False
     return observation, reward, alive
