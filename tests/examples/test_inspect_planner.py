@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -125,8 +126,31 @@ def test_what_is_not_a_checkpoint_or_of_another_size_is_one_line(run_main, tmp_p
     assert message.startswith("error: notes.pt is not a readable checkpoint")
     larger = save_untrained(tmp_path / "larger", 7, task=PENDULUM)
     message, _, _ = run_main(f"checkpoint={larger}", "state=0:0", "steps=2", "save=page")
-    assert "observation has 3 entries instead of the model's 7" in message
+    assert "was trained with observation size 7 and action size 1, the environment has 3 and 1" in message
     assert not (tmp_path / "page").exists()
+
+
+@pytest.mark.parametrize("play", ["planner", "bare"])
+def test_an_agent_of_another_task_is_refused(checkpoint, run_main, play):
+    message, _, _ = run_main(f"checkpoint={checkpoint}", "task=gym/InvertedPendulum-v5", f"play={play}", "save=page")
+    assert message.startswith("error: ") and "the environment has 4 and 1; use the task it was trained on" in message
+
+
+def test_a_folder_of_other_files_is_refused_before_any_work(checkpoint, run_main, tmp_path, monkeypatch):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "index.html").write_text("mine")
+    work = "torchrl_etdmpc.commands.inspect_planner.load_agent"
+    monkeypatch.setattr(work, lambda *_, **__: pytest.fail("the agent was read"))
+    message, _, _ = run_main(f"checkpoint={checkpoint}", "save=mine")
+    assert message == "error: save=mine holds other files; choose an empty or a new folder."
+
+
+def test_the_seed_reaches_the_page(checkpoint, run_main, monkeypatch):
+    made: dict[str, Any] = {}
+    monkeypatch.setattr("torchrl_etdmpc.commands.inspect_planner.make_page", lambda _, **given: made.update(given))
+    monkeypatch.setattr("torchrl_etdmpc.commands.inspect_planner.serve", lambda *_, **__: None)
+    assert run_main(f"checkpoint={checkpoint}", "state=0:0", "seed=17")[0] is None
+    assert made["seed"] == 17
 
 
 def test_a_missing_package_is_named_with_its_command(checkpoint, run_main, monkeypatch):

@@ -140,3 +140,14 @@ def test_an_episode_can_be_played_by_the_policy():
     trace = inspection.plan(State(0, 2))
     assert not trace["warm_start"].any()
     inspection.close()
+
+
+@pytest.mark.parametrize(("step", "left"), [(2, 3), (3, 2), (4, 1)])
+def test_a_plan_is_rolled_up_to_the_time_limit(step, left):
+    inspection = Inspection(make(), get_task("gym/Pendulum-v1", episode_length=5))
+    trace = inspection.plan(State(0, step))
+    assert inspection.length(0) == 5
+    assert trace["chosen_actions"].shape == (3, 1)
+    assert trace["real_rewards"].shape == (left,)
+    assert trace["real_points"].shape == (left + 1, 3)
+    inspection.close()

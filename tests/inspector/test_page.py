@@ -22,7 +22,7 @@ pytest.importorskip("gymnasium")
 from torchrl_etdmpc.envs import get_task  # noqa: E402
 from torchrl_etdmpc.inspector import load_trace, play_episode, trace_plan, with_settings  # noqa: E402
 from torchrl_etdmpc.inspector.inspection import Inspection, State, Strip  # noqa: E402
-from torchrl_etdmpc.inspector.page import make_page, page_settings, serve, slider_range  # noqa: E402
+from torchrl_etdmpc.inspector.page import make_page, serve, slider_range  # noqa: E402
 from torchrl_etdmpc.inspector.saved_page import write_page  # noqa: E402
 from torchrl_etdmpc.inspector.settings import settings_of_class  # noqa: E402
 from torchrl_etdmpc.modules import WorldModel  # noqa: E402
@@ -88,20 +88,25 @@ def test_every_setting_has_a_control_also_a_new_one():
     text = json.dumps(make_page(inspection).layout.to_plotly_json(), default=lambda part: part.to_plotly_json())
     for name in settings_of_class(Greedy):
         assert f'{{"type": "setting", "name": "{name}"}}' in text, name
-    assert "greed" in page_settings(inspection)
     inspection.close()
 
 
-@pytest.mark.parametrize("value", [0, 1, 3, 512])
+@pytest.mark.parametrize("value", [-3, 0, 1, 3, 512])
 def test_a_whole_slider_holds_its_value(value):
     low, high, step = slider_range(settings_of_class(Greedy)["horizon"], value)
     assert low <= value <= high and step == 1
 
 
-@pytest.mark.parametrize("value", [-2.0, 0.0, 0.05, 0.99, 2.0, 30.0])
-def test_a_number_s_slider_holds_its_value(value):
-    low, high, _ = slider_range(settings_of_class(Greedy)["beta"], value)
-    assert low <= value <= high
+@pytest.mark.parametrize("name", ["beta", "discount"])
+@pytest.mark.parametrize("value", [-2.0, -0.8, 0.0, 0.05, 0.99, 2.0, 30.0])
+def test_a_number_s_slider_holds_its_value(name, value):
+    low, high, step = slider_range(settings_of_class(Greedy)[name], value)
+    assert low <= value <= high and 0 < step < high
+
+
+@pytest.mark.parametrize("value", [0.0, 0.05, 0.8, 1.0, 10.0])
+def test_much_pessimism_can_be_reached_from_little(value):
+    assert slider_range(settings_of_class(Greedy)["beta"], value) == (0.0, 20.0, 0.1)
 
 
 def test_the_page_answers_this_machine_only(served):
@@ -403,3 +408,87 @@ def test_a_state_to_begin_with_is_planned_first(inspection):
     text = json.dumps(app.layout.to_plotly_json(), default=lambda part: part.to_plotly_json())
     assert '"id": "folder"' in text and '"value": "elsewhere"' in text
     assert '"value": 3' in text
+
+
+def test_the_seed_of_the_noise_to_begin_with_is_shown(inspection):
+    text = json.dumps(
+        make_page(inspection, seed=17).layout.to_plotly_json(), default=lambda part: part.to_plotly_json()
+    )
+    assert '"value": 17' in text
+
+
+def ask(app: Any, output: str, changed: str, **held: Any) -> dict[str, Any]:
+    """What the page answers when one part changes, by what its parts hold; nothing where all stays as it is."""
+    client = app.server.test_client()
+    options = {"headers": {"Host": "127.0.0.1"}}
+    (found,) = [
+        each
+        for each in client.get("/_dash-dependencies", **options).json
+        if output in each["output"] and each["clientside_function"] is None
+    ]
+    names = [name.rsplit(".", 1) for name in found["output"].strip(".").split("...")]
+    outputs: Any = [{"id": name, "property": part} for name, part in names]
+    told = {
+        kind: [[] if part["id"].startswith("{") else part | {"value": held.get(part["id"])} for part in found[kind]]
+        for kind in ("inputs", "state")
+    }
+    body = {
+        "output": found["output"],
+        "outputs": outputs if found["output"].startswith("..") else outputs[0],
+        "changedPropIds": [changed],
+        **told,
+    }
+    response = client.post("/_dash-update-component", json=body, **options)
+    assert response.status_code in (200, 204), response.text
+    return response.json["response"] if response.status_code == 200 else {}
+
+
+@pytest.fixture
+def with_replay() -> Iterator[Inspection]:
+    made = Inspection(make_planner(), TASK, steps=8, replay=lambda row: torch.zeros(3) + row, rows=50)
+    yield made
+    made.close()
+
+
+def number_of(inspection: Inspection, state: State) -> int:
+    job = inspection.start(state, {})
+    assert job.future is not None
+    return job.future.result()
+
+
+def test_the_filmstrip_is_that_of_the_plan_from_an_episode_to_the_replay_buffer_and_back(with_replay):
+    app = make_page(with_replay)
+    episode, row = number_of(with_replay, State(0, 3)), number_of(with_replay, State(0, 40, replay=True))
+    film = "strip.children"
+    seen = ask(app, film, "trace-a.data", **{"trace-a": episode})
+    assert (seen["step"], seen["filmed"]) == ({"max": 7}, {"data": 0})
+    assert ask(app, film, "trace-a.data", **{"trace-a": episode, "filmed": 0}) == {}
+    seen = ask(app, film, "trace-a.data", **{"trace-a": row, "filmed": 0})
+    assert seen == {"strip": {"children": []}, "step": {"max": 49}, "filmed": {"data": "replay"}}
+    assert ask(app, film, "trace-a.data", **{"trace-a": row, "filmed": "replay"}) == {}
+    seen = ask(app, film, "trace-a.data", **{"trace-a": episode, "filmed": "replay"})
+    assert (seen["step"], seen["filmed"]) == ({"max": 7}, {"data": 0})
+
+
+def test_a_step_beyond_the_end_of_what_is_chosen_is_the_last_one(with_replay):
+    app = make_page(with_replay)
+    step = {"step": {"value": 7}}
+    assert ask(app, "step.value", "source.value", source="episode", episode=0, step=40) == step  # not played yet
+    number_of(with_replay, State(0, 3))
+    assert ask(app, "step.value", "source.value", source="episode", episode=0, step=40) == step
+    assert ask(app, "step.value", "episode.value", source="episode", episode=0, step=7) == {}
+    assert ask(app, "step.value", "source.value", source="replay", episode=0, step=49) == {}
+    assert ask(app, "step.value", "source.value", source="replay", episode=None, step=60) == {"step": {"value": 49}}
+
+
+def test_what_is_shown_is_saved_whatever_the_controls_say_by_now(with_replay, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.inspector.saved_page.picture", lambda frame: "data:,")
+    with_replay.play(0)
+    frame = np.zeros((4, 4, 3), np.uint8)
+    monkeypatch.setattr(with_replay, "strip", lambda episode: Strip([0, 3], [frame] * 2) if episode == 0 else None)
+    app = make_page(with_replay)
+    for state, marked in ((State(0, 3), True), (State(0, 40, replay=True), False)):
+        shown = {"trace-a": number_of(with_replay, state), "folder": str(tmp_path / "page"), "episode": None}
+        said = ask(app, "saved.children", "save.n_clicks", **shown)
+        assert said == {"saved": {"children": f"saved: {tmp_path / 'page' / 'index.html'}"}}
+        assert ('class="here"><img alt="step 3"' in (tmp_path / "page" / "index.html").read_text()) == marked

@@ -3,6 +3,8 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
+import subprocess
 import zlib
 
 import numpy as np
@@ -11,7 +13,8 @@ import torch
 
 from torchrl_etdmpc.inspector import Trace, load_trace, trace_plan
 from torchrl_etdmpc.inspector.inspection import Strip
-from torchrl_etdmpc.inspector.saved_page import picture, setting_rows, write_page
+from torchrl_etdmpc.inspector.saved_page import facts_of, picture, setting_rows, write_page
+from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
 from torchrl_etdmpc.testing import LineWorld
 
@@ -68,6 +71,78 @@ def test_frames_are_pictures_in_the_page(tmp_path):
     page = write_page(tmp_path / "page", make(), strip=Strip([0, 7], [frame, frame]), step=7)
     assert page.read_text().count(picture(frame)) == 2
     assert 'class="here"><img alt="step 7"' in page.read_text()
+
+
+def test_the_frame_nearest_to_the_state_is_marked(tmp_path):
+    frame = np.zeros((4, 4, 3), np.uint8)
+    page = write_page(tmp_path / "page", make(), strip=Strip([0, 7, 14], [frame] * 3), step=9)
+    assert re.findall(r'class="here"><img alt="([^"]*)"', page.read_text()) == ["step 7"]
+
+
+def test_a_website_of_others_is_not_written_over(tmp_path):
+    (tmp_path / "index.html").write_text("mine")
+    (tmp_path / "data.js").write_text("mine = 1;")
+    with pytest.raises(FileExistsError, match="holds other files; choose an empty or a new folder"):
+        write_page(tmp_path, make())
+    assert (tmp_path / "index.html").read_text() == "mine"
+
+
+def test_a_page_that_was_cut_off_is_written_anew(tmp_path):
+    (write_page(tmp_path / "page", make())).unlink()
+    assert write_page(tmp_path / "page", make()).is_file()
+
+
+def action_values(**settings) -> Trace:
+    torch.manual_seed(0)
+    model = ActionValueWorldModel(3, 1, latent_dim=16, mlp_dim=16, num_dynamics=1, num_values=5)
+    budget = {"horizon": 3, "num_samples": 16, "num_elites": 4, "num_proposals": 2, "iterations": 2}
+    planner = EnsembleMPPIPlanner(LatentEnv(model), score="final", **budget | settings)
+    return trace_plan(planner, torch.zeros(3))
+
+
+def test_a_gain_by_other_value_heads_than_the_policy_s_says_so():
+    gain = facts_of(action_values())["gain"]
+    assert gain.endswith(" (the plan by 2 value heads, the policy by all 5)")
+    assert float(facts_of(make())["gain"]) is not None
+
+
+def test_a_clicked_candidate_has_the_columns_of_its_own_heads(tmp_path):
+    """The script on a stand-in of the browser: a candidate of an action-value critic has two heads, its choice five."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node: apt-get install nodejs")
+    trace = action_values(eval_first_action="mean")
+    folder = write_page(tmp_path / "page", trace).parent
+    script = """
+        const fs = require('fs'), drawn = {};
+        let click;
+        const part = id => ({id, addEventListener() {}, on: (_, call) => { click = call; }});
+        Object.assign(globalThis, {window: globalThis, document: {getElementById: part}, moveRing() {},
+            Plotly: {react: (div, data) => { drawn[div.id] = data; return {then: call => call()}; }}});
+        for (const name of ['data.js', 'saved_page.js']) {
+            require('vm').runInThisContext(fs.readFileSync(process.argv[1] + '/' + name, 'utf8'));
+        }
+        const before = drawn['return_table-a'][0].x;
+        click({points: [{customdata: 6}]});
+        console.log(JSON.stringify([before, drawn['return_table-a'][0]]));
+    """
+    run = subprocess.run([node, "-e", script, str(folder)], capture_output=True, text=True, check=False)
+    assert run.stderr == ""
+    before, table = json.loads(run.stdout)
+    assert before == ["1.1", "1.2", "1.3", "1.4", "1.5"]
+    assert table["x"] == ["1.1", "1.2"]
+    np.testing.assert_allclose(table["z"], trace["returns"][-1, 6].reshape(1, 2), rtol=1e-6)
+
+
+def test_a_plan_that_fell_back_has_a_page(tmp_path):
+    model = WorldModel(3, 1, latent_dim=16, mlp_dim=16)
+    for parameter in model.parameters():
+        torch.nn.init.constant_(parameter, torch.nan)
+    planner = EnsembleMPPIPlanner(LatentEnv(model), horizon=3, num_samples=16, num_elites=4, num_proposals=2)
+    trace = trace_plan(planner, torch.zeros(3))
+    page = write_page(tmp_path / "page", trace, trace)
+    assert "the policy: no candidate had a finite score" in page.read_text()
+    assert "NaN" not in (page.parent / "data.js").read_text()
 
 
 def test_other_files_are_not_written_over(tmp_path):

@@ -15,10 +15,10 @@ from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
-from torchrl_etdmpc.envs import Task
+from torchrl_etdmpc.envs import Task, make_env
 from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page import make_page, serve
-from torchrl_etdmpc.inspector.saved_page import plotly_script, write_page
+from torchrl_etdmpc.inspector.saved_page import free_folder, plotly_script, write_page
 from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.training import load_agent, resolve_device
 
@@ -62,11 +62,13 @@ class InspectConfig(PlannerCommandConfig):
 def main(config: InspectConfig) -> None:
     """Shows what the planner of a trained agent sees: candidates, heads and depths of any state, on a local page."""
     plotly_script()  # what is not installed is said before anything takes long
+    if config.save is not None:
+        free_folder(config.save)
     inspection = _inspection(config)
     try:
         state = _state(config, inspection)
         if config.save is None:
-            app = make_page(inspection, state=state, allow_remote=config.allow_remote)
+            app = make_page(inspection, state=state, seed=config.seed, allow_remote=config.allow_remote)
             serve(app, host=config.host, port=config.port, allow_remote=config.allow_remote, ready=_say_where)
         else:
             trace = inspection.plan(state, {}, seed=config.seed)
@@ -81,7 +83,8 @@ def _inspection(config: InspectConfig) -> Inspection:
     device = resolve_device(config.device)
     task = config.task_spec
     _need_no_renderer(task)
-    agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off")
+    sizes = {} if config.state.startswith("replay") else _sizes(task)  # a row of the buffer needs no simulator
+    agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off", **sizes)
     path = Path(config.checkpoint).expanduser()
     about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
     store = CheckpointStore(path.parent)
@@ -98,6 +101,15 @@ def _inspection(config: InspectConfig) -> Inspection:
         rows=rows,
         about={"checkpoint": about},
     )
+
+
+def _sizes(task: Task) -> dict[str, int]:
+    env = make_env(task)
+    env.close(raise_if_closed=False)
+    return {
+        "observation_dim": env.observation_spec["observation"].shape[-1],
+        "action_dim": env.action_spec.shape[-1],
+    }
 
 
 def _need_no_renderer(task: Task) -> None:

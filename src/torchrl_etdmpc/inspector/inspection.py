@@ -174,6 +174,11 @@ class Inspection:
         known = self._episodes.get(episode)
         return None if known is None else len(known[0].action)
 
+    @property
+    def decisions(self) -> int:
+        """Of an episode, at most."""
+        return self.steps or (1 if self.task is None else self.task.decision_steps_per_episode)
+
     def close(self) -> None:
         """Gives up what is being planned."""
         if self._job is not None:
@@ -245,12 +250,11 @@ class Inspection:
         if self.task is None:
             raise ValueError("state cannot be one of an episode: there is no task to play.")
         job.begin(f"playing episode {seed}")
-        of = self.steps or self.task.decision_steps_per_episode
         if self.bare:
             policy: Any = BarePolicy(self.planner.world_model)  # pyright: ignore[reportArgumentType]
         else:
             iterations = self.planner.iterations
-            policy = watched(self.planner, lambda asked: job.tell(asked // iterations, of))
+            policy = watched(self.planner, lambda asked: job.tell(asked // iterations, self.decisions))
         episode = play_episode(policy, self.task, seed=seed, steps=self.steps)
         job.begin("filming the episode")
         _keep(self._episodes, seed, (episode, self._film(episode)))
@@ -293,6 +297,8 @@ class Inspection:
             observations, rewards = [self.simulator.observation], []
             for action in actions:  # one by one, for frames of a smaller size
                 rolled = self.simulator.roll(action[None])
+                if not len(rolled.reward):  # the time limit came before
+                    break
                 observations.append(rolled.observation[-1])
                 rewards.append(rolled.reward[0])
                 if frames is not None:

@@ -17,12 +17,13 @@ from torchrl_etdmpc.inspector.inspection import Strip
 from torchrl_etdmpc.inspector.trace import Trace
 from torchrl_etdmpc.runs.files import write_whole
 
-__all__ = ["facts_of", "frames_of", "setting_rows", "write_page"]
+__all__ = ["facts_of", "frames_of", "free_folder", "setting_rows", "write_page"]
 
 MOVING = ("latent_plane", "return_table", "disagreement", "plan_gaussian")  # with the iteration
 WIDE = ("latent_plane",)
 ASSETS = Path(__file__).parent / "assets"
 _SCRIPT = Path(__file__).parent / "saved" / "saved_page.js"
+_MARK = "window.INSPECTION"
 _POLICY = "default-src 'none'; script-src 'self' file:; style-src 'self' file: 'unsafe-inline'; img-src data:"
 
 
@@ -48,21 +49,19 @@ def write_page(
         FileExistsError: if ``folder`` holds other files.
     """
     script = plotly_script()
-    folder = Path(folder).expanduser()
+    folder = free_folder(folder)
     page = folder / "index.html"
-    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not page.exists())):
-        raise FileExistsError(f"save={folder} holds other files; choose an empty or a new folder.")
     folder.mkdir(parents=True, exist_ok=True)
     sides = [trace] if other is None else [trace, other]
     content: dict[str, Any] = {
         "iterations": max(side.iterations for side in sides),
-        "moving": [name for name in MOVING if name in figures.FIGURES],
+        "moving": MOVING,
         "sides": [_side(side) for side in sides],
     }
     if other is not None:
         content["difference"] = _plain(figures.plain(figures.compare_plans)(trace, other))
+    write_whole(folder / "data.js", f"{_MARK} = {json.dumps(content)};\n")  # first: by it the folder is known again
     write_whole(folder / "plotly.min.js", script)
-    write_whole(folder / "data.js", f"window.INSPECTION = {json.dumps(content)};\n")
     for source in (ASSETS / "inspector.css", ASSETS / "inspector.js", _SCRIPT):
         write_whole(folder / source.name, source.read_text(encoding="utf-8"))
     trace.save(folder / "trace.npz")
@@ -72,6 +71,26 @@ def write_page(
         other.save(folder / "second.npz")
     write_whole(page, _html(sides, content["iterations"], strip, step))
     return page
+
+
+def free_folder(folder: str | Path) -> Path:
+    """Where a page may be written: a new or an empty folder, or one of a page that is replaced.
+
+    Raises:
+        FileExistsError: if ``folder`` holds other files.
+    """
+    folder = Path(folder).expanduser()
+    data = folder / "data.js"
+    if folder.exists() and not (folder.is_dir() and (_has_mark(data) or not any(folder.iterdir()))):
+        raise FileExistsError(f"save={folder} holds other files; choose an empty or a new folder.")
+    return folder
+
+
+def _has_mark(data: Path) -> bool:
+    if not data.is_file():
+        return False
+    with open(data, "rb") as file:
+        return file.read(len(_MARK)) == _MARK.encode()
 
 
 def plotly_script() -> str:
@@ -96,13 +115,16 @@ def facts_of(trace: Trace) -> dict[str, str]:
     about, facts = trace.manifest, {}
     state = about.get("state", {})
     if state.get("from") == "episode":
-        facts["state"] = f"episode {state['seed']}, step {state['step']}"
+        facts["state"] = f"episode {state.get('seed')}, step {state.get('step')}"
     elif state.get("from") == "replay":
-        facts["state"] = f"replay row {state['row']}"
+        facts["state"] = f"replay row {state.get('row')}"
     facts["score of the plan"] = f"{float(trace['value']):.3f}"
     if trace.get("policy_scores") is not None:
         facts["of the policy"] = f"{trace['policy_scores'].mean():.3f}"
         facts["gain"] = f"{float(trace['value']) - trace['policy_scores'].mean():.3f}"
+        heads = [table.shape[-1] for name in ("returns", "policy_returns") if (table := trace.get(name)) is not None]
+        if len(set(heads)) == 2:
+            facts["gain"] += f" (the plan by {heads[0]} value heads, the policy by all {heads[1]})"
     chosen = int(trace["chosen"])
     facts["chosen"] = "mean of the elites" if chosen < 0 else f"candidate {chosen}"
     if chosen >= 0 and trace["proposals"][chosen]:
@@ -184,7 +206,7 @@ def _side(trace: Trace) -> dict[str, Any]:
 
 def _html(sides: list[Trace], iterations: int, strip: Strip | None, step: int | None) -> str:
     about = sides[0].manifest
-    title = html.escape(f"{about.get('task') or 'a model'}: what the planner saw")
+    title = html.escape(f"{about.get('task') or 'a model'}: what the planner sees")
     saved = html.escape(str((about.get("checkpoint") or {}).get("name", "")))
     panels = []
     for name, heading in figures.FIGURES.items():
@@ -203,8 +225,9 @@ def _html(sides: list[Trace], iterations: int, strip: Strip | None, step: int | 
         )
     pictures = ""
     if strip is not None and strip.frames:
+        here = None if step is None else min(strip.steps, key=lambda at: abs(at - step))
         inside = "".join(
-            f'<figure class="{"here" if at == step else ""}"><img alt="step {at}" src="{picture(frame)}">{at}</figure>'
+            f'<figure class="{"here" if at == here else ""}"><img alt="step {at}" src="{picture(frame)}">{at}</figure>'
             for at, frame in zip(strip.steps, strip.frames, strict=True)
         )
         pictures = f'<h2>Episode</h2><div class="strip">{inside}</div>'

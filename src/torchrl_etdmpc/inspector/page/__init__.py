@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchrl_etdmpc.inspector.page.app import make_page
-from torchrl_etdmpc.inspector.page.controls import page_settings, slider_range
+from torchrl_etdmpc.inspector.page.controls import slider_range
 from torchrl_etdmpc.inspector.page.server import serve
 
-__all__ = ["make_page", "page_settings", "serve", "slider_range"]
+__all__ = ["make_page", "serve", "slider_range"]

@@ -16,7 +16,12 @@ from torchrl_etdmpc.inspector.saved_page import ASSETS
 
 
 def make_page(
-    inspection: Inspection, *, state: State | None = None, allow_remote: bool = False, folder: str | Path = "page"
+    inspection: Inspection,
+    *,
+    state: State | None = None,
+    seed: int = 0,
+    allow_remote: bool = False,
+    folder: str | Path = "page",
 ) -> Any:
     """A dash app.
 
@@ -25,6 +30,7 @@ def make_page(
 
     Keyword Args:
         state (State, optional): that is planned first. Default: the first decision of episode 0.
+        seed (int): of the noise of the first plan. Default: 0.
         allow_remote (bool): whether requests that name another host than this machine are answered.
         folder (str or Path): where pages are saved, unless the page is told otherwise. Default: ``"page"``.
 
@@ -50,7 +56,7 @@ def make_page(
     )
     if not allow_remote:
         answer_this_machine_only(app.server)
-    app.layout = page_layout(inspection, State(episode=0, step=0) if state is None else state, str(folder))
+    app.layout = page_layout(inspection, State(episode=0, step=0) if state is None else state, str(folder), seed)
     for connect in (connect_plans, connect_figures, connect_filmstrip, connect_saving):
         connect(app, inspection)
     return app

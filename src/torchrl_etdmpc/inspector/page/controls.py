@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.settings import PlannerSetting, plain_settings
 
 _AS_GIVEN = "as given"  # a score of one's own
-
-
-def page_settings(inspection: Inspection) -> Mapping[str, PlannerSetting]:
-    """What the page has a control for."""
-    return {name: setting for name, setting in inspection.settings.items() if setting.kind != "other"}
 
 
 def slider_range(setting: PlannerSetting, value: float) -> tuple[float, float, float]:
@@ -23,24 +17,24 @@ def slider_range(setting: PlannerSetting, value: float) -> tuple[float, float, f
     (0, 12, 1)
     """
     default = setting.default if isinstance(setting.default, int | float) else 0
-    most = max(abs(value), abs(default))
+    most = 2 * max(abs(value), abs(default))
     if setting.kind == "whole":
-        return 0, int(max(2 * most, 4)), 1
-    if most == 0:
-        return 0.0, 20.0, 0.1
-    if 0.5 < most <= 1:
+        most = int(max(most, 4))
+        return (0 if value >= 0 else -most), most, 1
+    if 1 < most <= 2 and value >= 0 and default > 0:  # a share
         return 0.0, 1.0, 0.005
-    return (0.0 if value >= 0 else -2 * most), 2 * most, most / 50
+    if default == 0:  # of which nothing says how much is a lot
+        most = max(most, 20.0)
+    return (0.0 if value >= 0 else -most), most, most / (100 if default else 200)
 
 
-def controls(inspection: Inspection, first: State, folder: str) -> list[Any]:
+def controls(inspection: Inspection, first: State, folder: str, seed: int) -> list[Any]:
     """Everything beside the plan: the state, the planner's settings, holding and saving."""
     from dash import dcc, html
 
     sources = [{"label": " episode", "value": "episode"}]
     if inspection.replay is not None:
         sources.append({"label": f" replay ({inspection.rows:,} rows)", "value": "replay"})
-    most = inspection.steps or (inspection.task.decision_steps_per_episode if inspection.task else 1)
     state = [
         html.H2("State"),
         dcc.RadioItems(sources, "replay" if first.replay else "episode", id="source", inline=True),
@@ -51,7 +45,7 @@ def controls(inspection: Inspection, first: State, folder: str) -> list[Any]:
             "step",
             dcc.Slider(
                 0,
-                inspection.rows - 1 if first.replay else most - 1,
+                (inspection.rows if first.replay else inspection.decisions) - 1,
                 1,
                 value=first.step,
                 id="step",
@@ -61,7 +55,7 @@ def controls(inspection: Inspection, first: State, folder: str) -> list[Any]:
             ),
             "step-name",
         ),
-        _named("seed of the noise", dcc.Input(id="seed", type="number", min=0, step=1, value=0, debounce=True)),
+        _named("seed of the noise", dcc.Input(id="seed", type="number", min=0, step=1, value=seed, debounce=True)),
     ]
     values = plain_settings(inspection.planner)
     settings = [html.H2("Planner"), html.Button("as it was trained", id="reset"), html.Div(id="unused")]

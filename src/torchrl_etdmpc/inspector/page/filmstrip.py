@@ -17,17 +17,19 @@ def connect_filmstrip(app: Any, inspection: Inspection) -> None:
         Output("step", "max"),
         Output("filmed", "data"),
         Input("trace-a", "data"),
-        State("source", "value"),
-        State("episode", "value"),
         State("filmed", "data"),
         prevent_initial_call=True,
     )
-    def film(_: Any, source: str, episode: Any, filmed: str | None) -> tuple[Any, ...]:
-        if source == filmed == "replay" or episode == filmed:  # the pictures are there
+    def film(number: int | None, filmed: Any) -> tuple[Any, ...]:
+        trace = None if number is None else inspection.traces.get(number)
+        if trace is None:
             return (no_update,) * 3
-        if source == "replay":
-            return [], inspection.rows - 1, source
-        strip, length = inspection.strip(int(episode)), inspection.length(int(episode))
+        episode = trace.manifest["state"].get("seed", "replay")
+        if episode == filmed:  # the pictures are there
+            return (no_update,) * 3
+        if episode == "replay":
+            return [], inspection.rows - 1, episode
+        strip, length = inspection.strip(episode), inspection.length(episode)
         if strip is None or length is None:
             return (no_update,) * 3
         pictures = [
@@ -46,7 +48,21 @@ def connect_filmstrip(app: Any, inspection: Inspection) -> None:
     @app.callback(
         Output("step", "value"),
         Input({"type": "frame", "step": ALL}, "n_clicks"),
+        Input("source", "value"),
+        Input("episode", "value"),
+        State("step", "value"),
         prevent_initial_call=True,
     )
-    def choose(clicks: list[Any]) -> Any:
+    def choose(clicks: list[Any], source: str, episode: Any, step: int) -> Any:
+        if ctx.triggered_id in ("source", "episode"):
+            last = _last(inspection, source, episode)
+            return last if last < step else no_update
         return ctx.triggered_id["step"] if any(clicks) and ctx.triggered_id else no_update
+
+
+def _last(inspection: Inspection, source: str, episode: int | None) -> int:
+    """The last step, as far as it is known before the episode is played."""
+    if source == "replay":
+        return inspection.rows - 1
+    length = None if episode is None else inspection.length(int(episode))
+    return (length or inspection.decisions) - 1

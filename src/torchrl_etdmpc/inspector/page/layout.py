@@ -12,7 +12,7 @@ from torchrl_etdmpc.inspector.saved_page import WIDE
 _GRAPH: Any = {"displayModeBar": False, "responsive": False}  # inspector.js fits them
 
 
-def page_layout(inspection: Inspection, first: State, folder: str) -> Any:
+def page_layout(inspection: Inspection, first: State, folder: str, seed: int) -> Any:
     """The controls, the plan and what is kept in the browser."""
     from dash import dcc, html
 
@@ -30,7 +30,7 @@ def page_layout(inspection: Inspection, first: State, folder: str) -> Any:
     poll = dcc.Interval(id="poll", interval=200, disabled=True)
     body = html.Div(
         [
-            html.Aside(controls(inspection, first, folder), className="controls"),
+            html.Aside(controls(inspection, first, folder, seed), className="controls"),
             html.Main(_main(), id="main", className="main"),
         ],
         className="body",

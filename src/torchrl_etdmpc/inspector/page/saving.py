@@ -18,19 +18,16 @@ def connect_saving(app: Any, inspection: Inspection) -> None:
         State("folder", "value"),
         State("trace-a", "data"),
         State("trace-b", "data"),
-        State("source", "value"),
-        State("episode", "value"),
-        State("step", "value"),
         prevent_initial_call=True,
     )
-    def save(_: Any, folder: str | None, one: Any, two: Any, source: str, episode: Any, step: Any) -> str:
+    def save(_: Any, folder: str | None, one: Any, two: Any) -> str:
         if one not in inspection.traces:
             return "There is nothing to save yet."
-        strip = None if source == "replay" else inspection.strip(int(episode))
+        trace = inspection.traces[one]
+        state = trace.manifest["state"]
+        strip = inspection.strip(state["seed"]) if state["from"] == "episode" else None
         try:
-            page = write_page(
-                folder or "page", inspection.traces[one], inspection.traces.get(two), strip=strip, step=step
-            )
+            page = write_page(folder or "page", trace, inspection.traces.get(two), strip=strip, step=state.get("step"))
         except OSError as error:
             return " ".join(str(error).split())
         return f"saved: {page}"

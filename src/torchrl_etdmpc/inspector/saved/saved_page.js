@@ -39,6 +39,9 @@
       rows.push(Array.from(packed.numbers.subarray(begin + row * columns, begin + (row + 1) * columns)));
     }
     figure.data[0].z = rows;
+    figure.data[0].x = rows[0].map(function (_, at) { // what was searched with, fewer heads than judge the rest
+      return (Math.floor(at / shape[4]) + 1) + "." + (at % shape[4] + 1);
+    });
     var score = INSPECTION.sides[side].scores[iteration][state.candidate];
     figure.layout.title = { text: "candidate " + state.candidate + ", score " + (score === null ? "not finite" : score.toFixed(3)), font: { size: 13 } };
   }
