@@ -102,7 +102,7 @@ def main(config: EvaluateConfig) -> None:
     )
     env.close(raise_if_closed=False)
     elsewhere = "" if task.name == trained.task else f"on {trained.task} "
-    told = _outcome(config, task, played, f"{elsewhere}for {counters['env_steps']}")
+    told = _outcome(config, task, played, f"{elsewhere}for {counters.get('env_steps', 'an unknown number of')}")
     try:
         if config.csv:
             write_whole(Path(config.csv).expanduser(), _table(task, played))

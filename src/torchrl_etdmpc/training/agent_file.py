@@ -184,9 +184,9 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
         if not isinstance(content[name], kind):
             found = type(content[name]).__name__
             raise CheckpointError(f"{path} is not a checkpoint: its {name} is of type {found}, not {kind.__name__}.")
-    for name, entry in (("config", "task"), ("config", "planner"), ("counters", "env_steps")):
-        if entry not in content[name]:
-            raise CheckpointError(f"{path} is not a whole checkpoint: its {name} lacks {entry}.")
+    for entry in ("task", "planner"):
+        if entry not in content["config"]:
+            raise CheckpointError(f"{path} is not a whole checkpoint: its config lacks {entry}.")
     for name, value in (*content["world_model"].items(), *content["loss"].items()):
         if not isinstance(value, torch.Tensor):
             raise CheckpointError(
