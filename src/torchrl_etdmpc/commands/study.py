@@ -103,7 +103,7 @@ def _main(config: StudyConfig) -> None:
         "task": task.name,
         "checkpoint": config.checkpoint,
         "checkpoint_sha256": checksum(config.checkpoint),
-        "trained_env_steps": counters["env_steps"],
+        "trained_env_steps": counters.get("env_steps"),
         "episodes": config.episodes,
         "mean_return": returns.mean().item(),
         "states_asked": config.states,
@@ -114,7 +114,7 @@ def _main(config: StudyConfig) -> None:
         "versions": library_versions(),
     }
     print(
-        f"{task.name}, trained for {counters['env_steps']} env steps: {config.episodes} episodes, "
+        f"{task.name}, trained for {counters.get('env_steps', 'an unknown number of')} env steps: {config.episodes} episodes, "
         f"return {returns.mean():.1f}"
     )
     simulator = Simulator(task)
