@@ -114,8 +114,8 @@ def _main(config: StudyConfig) -> None:
         "versions": library_versions(),
     }
     print(
-        f"{task.name}, trained for {counters.get('env_steps', 'an unknown number of')} env steps: {config.episodes} episodes, "
-        f"return {returns.mean():.1f}"
+        f"{task.name}, trained for {counters.get('env_steps', 'an unknown number of')} env steps: "
+        f"{config.episodes} episodes, return {returns.mean():.1f}"
     )
     simulator = Simulator(task)
     names = [name for name in get_args(StudyName) if name != "all"] if config.study == "all" else [config.study]
