@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from torchrl_etdmpc.commands import suite
+from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.suites import read_experiment
-from torchrl_etdmpc.suites.experiment import flat
 
 # Table A.1, column BMPC, and section 2.4 of what it inherits; every number is written out here.
 BMPC = {

@@ -23,6 +23,7 @@ import yaml
 
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
 from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.runs.dotted import flat
 
 SEED_COLUMNS = ("method", "task", "seed", "env_steps", "return_mean")
 POINT_COLUMNS = ("method", "task", "env_steps", "mean", "source")
@@ -121,7 +122,7 @@ class Run:
         columns = {name: table[name].astype(float) for name in ("env_steps", "return_mean")}
         curve = pd.DataFrame({**names, **columns})
         changed = tuple(f"{name}={value}" for name, value in told.items())
-        known = _flat(values) if file == directory.config else {}
+        known = flat(values) if file == directory.config else {}
         settings = {name: value for name, value in known.items() if name not in _NO_SETTING_OF_THE_METHOD}
         return cls(
             directory.path, **names, finished=directory.finished, curve=curve, changed=changed, settings=settings
@@ -196,13 +197,6 @@ def _header(file: Path, values: Mapping[str, Any]) -> dict[str, Any]:
     if not all(isinstance(header[key], kind) and header[key] != "" for key, kind in kinds.items()):
         raise ValueError(f"{file} does not give the run's task, preset and seed.")
     return header | {name: values[name] if type(values.get(name)) is int else None for name in CHANGED}
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
 
 
 def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:

@@ -9,12 +9,13 @@ import os
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from torchrl_etdmpc.commands.settings_help import Setting, groups_of, help_text, settings_of
 from torchrl_etdmpc.envs import import_task, list_tasks
 from torchrl_etdmpc.runs import console, first_line
+from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.training import PRESETS, TASK_SETTINGS, TrainConfig, config_from_dict, follow_own_code, preset
 
 
@@ -133,7 +134,7 @@ def _answer(arguments: list[str], config_class: type, what: str) -> str | None:
     for argument in arguments:
         name, equals, value = argument.partition("=")
         if equals and name == "preset" and "preset" in settings:
-            values = _flat(preset(value).to_dict())
+            values = flat(preset(value).to_dict())
         elif argument not in asked and not equals:
             topic = argument.lstrip("-").removesuffix(".*").rstrip(".")
             known = [*groups_of(config_class), *settings]
@@ -244,13 +245,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
     near += [other for part in difflib.get_close_matches(last, parts, n=2, cutoff=0.75) for other in [parts[part]]]
     found = list(dict.fromkeys([*same, *near]))[:3]
     return f"did you mean {' or '.join(found)}? --help lists all." if found else "--help lists all."
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
 
 
 def explicit_settings(arguments: list[str] | None = None) -> list[str]:

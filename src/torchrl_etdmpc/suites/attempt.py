@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.suites.experiment import Run, flat
+from torchrl_etdmpc.runs.dotted import flat
+from torchrl_etdmpc.suites.experiment import Run
 from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, preset
 
 End = Literal["finished", "stopped", "elsewhere", "failed"]

@@ -15,6 +15,7 @@ import yaml
 from torchrl_etdmpc.analysis import BENCHMARKS
 from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import DamagedFileError
+from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.runs.files import read_whole, write_whole
 from torchrl_etdmpc.training import CHANGEABLE, TASK_SETTINGS, TrainConfig, preset
 
@@ -482,14 +483,6 @@ def _put(values: dict[str, Any], name: str, value: Any) -> None:
         values = values.setdefault(group, {})
         _require(isinstance(values, dict), f"unknown setting {name}; {group} has none below it.")
     values[last] = value
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
 
 
 def _require(condition: bool, message: str) -> None:

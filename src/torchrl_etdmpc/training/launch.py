@@ -17,6 +17,7 @@ from torchrl import torchrl_logger
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
+from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
@@ -298,8 +299,8 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
     >>> resumed_config(preset("cpu"), {"total_env_steps": 100_000}, ["total_env_steps"]).total_env_steps
     100000
     """
-    values = _flat(saved.to_dict())
-    wanted = _flat(asked.to_dict() if isinstance(asked, TrainConfig) else asked)
+    values = flat(saved.to_dict())
+    wanted = flat(asked.to_dict() if isinstance(asked, TrainConfig) else asked)
     for name in explicit:
         if name in CHANGEABLE:
             values[name] = wanted[name]
@@ -314,13 +315,6 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
 def _typed(name: str) -> str:
     """A setting as it is written on the command line."""
     return f"task.{name}" if name in TASK_SETTINGS else name
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
 
 
 def _nested(values: dict[str, Any]) -> dict[str, Any]:
