@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from torchrl_etdmpc.modules import (
-    ActionValueModel,
     ActionValueWorldModel,
-    PredictionModel,
     SquashedGaussianPolicy,
     WorldModel,
+    has_action_values,
+    require_prediction_model,
 )
 from torchrl_etdmpc.modules.normed_linear import INIT_STD
 
@@ -29,9 +29,9 @@ def disturbed(**options) -> ActionValueWorldModel:
 
 
 def test_it_is_a_prediction_model_with_action_values_and_the_other_one_is_not():
-    assert isinstance(build(), PredictionModel)
-    assert isinstance(build(), ActionValueModel)
-    assert not isinstance(WorldModel(O, A), ActionValueModel)
+    require_prediction_model(build())
+    assert has_action_values(build())
+    assert not has_action_values(WorldModel(O, A))
 
 
 def test_its_sizes_are_tdmpc2_s():

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, PredictionModel
-from torchrl_etdmpc.modules import device_and_dtype
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc.modules import device_and_dtype, require_prediction_model
 from torchrl_etdmpc.testing import LineWorld, LQRWorld
 
 
@@ -43,8 +43,9 @@ class Pendulum(nn.Module):
 
 def test_the_models_of_the_package_are_prediction_models(build):
     for model in (build(), build(termination=True), LineWorld(), LQRWorld(), Pendulum()):
-        assert isinstance(model, PredictionModel)
-    assert not isinstance(nn.Linear(3, 2), PredictionModel)
+        require_prediction_model(model)
+    with pytest.raises(TypeError, match="^world_model must have the members of Pred.*, got Linear without obs"):
+        require_prediction_model(nn.Linear(3, 2))
     assert not hasattr(LineWorld(), "bins")
 
 

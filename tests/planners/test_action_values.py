@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, export_planner, export_policy
-from torchrl_etdmpc.modules import ActionValueModel, ActionValueWorldModel
+from torchrl_etdmpc.modules import ActionValueWorldModel, has_action_values, require_prediction_model
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.planners.imagination import sampled_values
 
@@ -125,7 +125,8 @@ class Slope(nn.Module):
 
 
 def test_a_model_of_ones_own_with_action_values_is_planned_over():
-    assert isinstance(Slope(), ActionValueModel)
+    require_prediction_model(Slope())
+    assert has_action_values(Slope())
     planner = EnsembleMPPIPlanner(LatentEnv(Slope()), horizon=2, score="final", warm_start=False)
     assert (planner.plan(torch.zeros(2, 1), explore=False).action > 0.5).all()
 

@@ -12,7 +12,8 @@ from torchrl.envs import EnvBase, ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv
 from torchrl.modules import WorldModel, WorldModelWrapper
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, PredictionModel
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc.modules import require_prediction_model
 from torchrl_etdmpc.planners import TorchRLModel
 
 GOAL = 1.0
@@ -102,7 +103,7 @@ def observations(model: TorchRLModel, place: Tensor) -> Tensor:
 
 
 def test_the_ensemble_planner_finds_the_known_optimum(adapted):
-    assert isinstance(adapted, PredictionModel)
+    require_prediction_model(adapted)
     budget = {"horizon": 2, "num_samples": 64, "num_elites": 8, "num_proposals": 0, "iterations": 4}
     planner = EnsembleMPPIPlanner(LatentEnv(adapted), warm_start=False, **budget)
     place = torch.tensor([-1.0, 0.8, 1.0, 1.25, 3.0])

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, PredictionModel, export_planner, export_policy
-from torchrl_etdmpc.modules import PolicyModel
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, export_planner, export_policy
+from torchrl_etdmpc.modules import has_policy, require_prediction_model
 from torchrl_etdmpc.planners import BarePolicy
 
 START = {"horizon": 2, "num_samples": 64, "num_elites": 8, "num_proposals": 0, "iterations": 4, "warm_start": False}
@@ -54,8 +54,8 @@ def test_a_model_of_one_s_own_is_short():
 
 
 def test_a_policy_is_no_part_of_what_planning_needs():
-    assert isinstance(Line(), PredictionModel)
-    assert not isinstance(Line(), PolicyModel)
+    require_prediction_model(Line())
+    assert not has_policy(Line())
 
 
 def test_the_planner_finds_the_optimum_without_proposals():

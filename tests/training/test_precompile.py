@@ -18,7 +18,7 @@ needs_compiler = pytest.mark.skipif(
 
 
 @pytest.fixture
-def watched(monkeypatch):
+def watched(monkeypatch, agent):
     """What happens while something precompiles, in order: parts that are called, helpers that are asked and awaited."""
     events: list[object] = []
     compiled = []
@@ -29,6 +29,7 @@ def watched(monkeypatch):
 
     @contextlib.contextmanager
     def helper(request):
+        assert request[1:4] == (5, 1, str(agent.device))
         events.append(("asks for", request[-1]))
         yield Helper()
         events.append("ends")
@@ -79,6 +80,16 @@ def test_with_several_threads_the_cores_share_the_parts(monkeypatch, watched, ti
     run(tiny_config, agent)
     asks, waits, ends = [("asks for", [*names]) for names in asked], ["waits"] * len(asked), ["ends"] * len(asked)
     assert watched == [*asks, *own, *waits, *"".join(asked), *ends]
+
+
+def test_beside_a_gpu_the_cores_share_the_parts_whatever_the_threads(monkeypatch, watched, tiny_config, agent):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(type(agent), "device", torch.device("cuda:1"))
+    monkeypatch.setattr(torch.random, "fork_rng", lambda devices: contextlib.nullcontext())
+    run(tiny_config, agent)
+    assert watched[0] == ("asks for", ["b", "d"])
+    assert watched[1:] == ["a", "c", "waits", "b", "d", "ends"]
 
 
 def test_nobody_waits_for_helpers_where_the_cache_has_everything(monkeypatch, watched, tiny_config, agent):

@@ -28,11 +28,13 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | Non
     if batch.dtype != torch.float64:  # torch.quantile takes no half precision
         batch = batch.float()
     levels = torch.linspace(0.05, 0.95, 2, dtype=batch.dtype, device=batch.device)  # made there, not sent there
-    if counts is None:
-        quantiles = torch.quantile(batch, levels)
-    else:
-        # What does not count becomes NaN, which nanquantile leaves out; a NaN that counts must not be left out.
-        finite = (batch.isfinite() | ~counts.flatten()).all()
-        quantiles = torch.nanquantile(torch.where(counts.flatten() & finite, batch, torch.nan), levels)
+    counts = torch.ones_like(batch, dtype=torch.bool) if counts is None else counts.flatten()
+    # torch.nanquantile, in operations that every supported PyTorch compiles. What does not count comes last; a value
+    # that counts and is not finite makes every quantile infinite, and the spread NaN.
+    finite = (batch.isfinite() | ~counts).all()
+    ordered = torch.where(counts & finite, batch, torch.inf).sort().values
+    ranks = levels * (counts.sum() - 1).clamp_min(0)
+    below = ranks.floor()
+    quantiles = torch.lerp(ordered[below.long()], ordered[ranks.ceil().long()], ranks - below)
     spread = (quantiles[1] - quantiles[0]).to(scale.dtype).clamp_min(1.0)
     return torch.lerp(scale, torch.where(spread.isfinite(), spread, scale), tau)

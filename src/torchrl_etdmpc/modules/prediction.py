@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypeGuard, runtime_checkable
+from typing import Any, Protocol, TypeGuard
 
 import torch
 from torch import Tensor, nn
 
 
-@runtime_checkable
 class PredictionModel(Protocol):
     """A world model as the planner, the imagined environment and the exporters see it.
 
@@ -21,9 +20,11 @@ class PredictionModel(Protocol):
     A model with a policy has ``policy`` and ``act`` as well (:class:`PolicyModel`), from which the planner takes its
     proposals; without one it is driven with ``num_proposals=0``.
 
+    Ask :func:`require_prediction_model`, :func:`has_policy` and :func:`has_action_values`, not ``isinstance``: from
+    Python 3.12 on it does not see the parameters, buffers and submodules of a module.
+
     >>> from torchrl_etdmpc.testing import LineWorld
-    >>> isinstance(LineWorld(), PredictionModel)
-    True
+    >>> require_prediction_model(LineWorld())
     """
 
     observation_dim: int | None
@@ -75,12 +76,11 @@ class PredictionModel(Protocol):
         ...
 
 
-@runtime_checkable
 class PolicyModel(PredictionModel, Protocol):
     """A :class:`PredictionModel` with a policy, which proposes to the planner and can act alone.
 
     >>> from torchrl_etdmpc.modules import WorldModel
-    >>> isinstance(WorldModel(3, 2, latent_dim=16, mlp_dim=32), PolicyModel)
+    >>> has_policy(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
     True
     """
 
@@ -101,7 +101,6 @@ class PolicyModel(PredictionModel, Protocol):
         ...
 
 
-@runtime_checkable
 class ActionValueModel(PolicyModel, Protocol):
     """A world model whose critic also reads the action; the planner knows it by the members below.
 
@@ -109,7 +108,7 @@ class ActionValueModel(PolicyModel, Protocol):
     the value of a latent. The planner asks for :meth:`action_values` of actions that it samples from the policy.
 
     >>> from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
-    >>> isinstance(ActionValueWorldModel(3, 2), ActionValueModel), isinstance(WorldModel(3, 2), ActionValueModel)
+    >>> has_action_values(ActionValueWorldModel(3, 2)), has_action_values(WorldModel(3, 2))
     (True, False)
     """
 
@@ -128,6 +127,15 @@ def has_policy(model: object) -> TypeGuard[PolicyModel]:
     False
     """
     return any(getattr(model, name, None) is not None for name in _POLICY)
+
+
+def has_action_values(model: object) -> TypeGuard[ActionValueModel]:
+    """Whether a model's critic also reads the action.
+
+    >>> has_action_values(torch.nn.Linear(2, 2))
+    False
+    """
+    return getattr(model, "action_values", None) is not None
 
 
 def require_policy(model: PredictionModel, what: str) -> PolicyModel:
@@ -149,14 +157,16 @@ _POLICY = ("policy", "act")
 
 
 def require_prediction_model(model: object) -> None:
-    """Checks that an object is a module with every member of :class:`PredictionModel`; with a policy, of its too.
+    """Checks that an object is a module with every member of :class:`PredictionModel`; with a policy or action values,
+    of theirs too.
 
     Raises:
         TypeError: naming what is missing.
     """
     members = [*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_"))]
     members += _POLICY if has_policy(model) else ()
-    missing = [name for name in members if not hasattr(model, name)]
+    members += (*_POLICY, "num_values") if has_action_values(model) else ()
+    missing = [name for name in dict.fromkeys(members) if not hasattr(model, name)]
     if missing:
         raise TypeError(
             f"world_model must have the members of PredictionModel, got {type(model).__name__} without "

@@ -43,7 +43,7 @@ from torchrl_etdmpc.keys import (
     VALUE,
     VERSION,
 )
-from torchrl_etdmpc.modules.prediction import ActionValueModel, PredictionModel, has_policy
+from torchrl_etdmpc.modules.prediction import PredictionModel, has_action_values, has_policy
 from torchrl_etdmpc.planners.imagination import imagined_returns, policy_gaussian, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
@@ -219,8 +219,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.next_plan_mean_key = unravel_key((NEXT, plan_mean_key))
         self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}
         self._warned_cold = False
-        # Asked once: the compiler cannot ask a Protocol.
-        self._num_action_values = env.world_model.num_values if isinstance(env.world_model, ActionValueModel) else 0
+        self._num_action_values = env.world_model.num_values if has_action_values(env.world_model) else 0
         carried = [self.is_init_key, self.plan_mean_key] if warm_start else []
         written = [*self.plan_keys.values(), *([self.next_plan_mean_key] if warm_start else [])]
         # TorchRL's types know one key only.

@@ -27,8 +27,8 @@ _HELP = "from torchrl_etdmpc.training.precompile import help_to_compile; help_to
 def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_batch: Sequence[int]) -> float:
     """Compiles what the run will call, on made-up data; weights, running scale and random numbers do not move.
 
-    On a CPU a run of several threads also compiles in further processes, which fill PyTorch's cache for this one. With
-    ``compile=auto`` a failure to compile is a warning, and the run goes on without.
+    On a GPU, and on a CPU with several threads, further processes compile too, which fill PyTorch's cache for this one.
+    With ``compile=auto`` a failure to compile is a warning, and the run goes on without.
 
     Args:
         config (TrainConfig): the run.
@@ -45,7 +45,7 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     tick, device = time.perf_counter(), agent.device
     parts = _parts(config, agent, batch, eval_batch)
     calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
-    several = device.type == "cpu" and torch.get_num_threads() > 1
+    several = device.type == "cuda" or torch.get_num_threads() > 1
     processes = min(os.cpu_count() or 1, len(parts)) if several else 1
     own, *others = ([*parts][first::processes] for first in range(processes))
     try:
@@ -58,8 +58,8 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
                     parts[name]()
                     progress.advance()
 
-            sizes = agent.world_model.observation_dim, agent.world_model.action_dim
-            requests = ((config, *sizes, batch, eval_batch, names) for names in others)
+            network = agent.world_model.observation_dim, agent.world_model.action_dim, str(device)
+            requests = ((config, *network, batch, eval_batch, names) for names in others)
             helpers = [stack.enter_context(_helper(request)) for request in requests]
             before = _graphs_not_in_the_cache()
             call(own)
@@ -103,11 +103,11 @@ def _helper(request: tuple[object, ...]) -> Iterator[subprocess.Popen[bytes]]:
 
 def help_to_compile() -> None:
     """What a helper runs: reads a request of :func:`precompile` from its input."""
-    (threads, precision), (config, *sizes, batch, eval_batch, names) = pickle.load(sys.stdin.buffer)
+    (threads, precision), (config, *network, batch, eval_batch, names) = pickle.load(sys.stdin.buffer)
     torch.set_num_threads(threads)
     if precision != torch.get_float32_matmul_precision():  # setting what it is changes what the cache goes by
         torch.set_float32_matmul_precision(precision)
-    parts = _parts(config, build_agent(config, *sizes), batch, eval_batch)
+    parts = _parts(config, build_agent(config, *network), batch, eval_batch)
     for name in names:
         parts[name]()
 
