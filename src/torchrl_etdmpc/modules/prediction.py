@@ -162,6 +162,9 @@ def require_prediction_model(model: object) -> None:
 
     Raises:
         TypeError: naming what is missing.
+
+    >>> from torchrl_etdmpc.modules import WorldModel
+    >>> require_prediction_model(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
     """
     members = [*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_"))]
     members += _POLICY if has_policy(model) else ()
