@@ -174,11 +174,11 @@ class StepSliceSampler(Sampler):
         if self.partial:
             # The last step again, so that what is masked is as finite and as far from zero as the rest.
             last = self._trajectories.lengths[chosen] - 1
-            valid = torch.from_numpy((steps <= last).reshape(shape)).to(_device(storage))
+            valid = _sent((steps <= last).reshape(shape), storage)
             info[self.mask_key] = valid  # pyright: ignore[reportArgumentType]  # nested keys are fine
             steps = np.minimum(steps, last)
         rows = self._trajectories.rows(chosen, steps) % storage.max_size
-        return torch.from_numpy(rows.reshape(shape)).to(_device(storage)), info
+        return _sent(rows.reshape(shape), storage), info
 
     def _sampleable_count(self, storage: Storage, batch_size: int) -> int:
         return int(self._follow(storage)[1].sum())
@@ -362,6 +362,10 @@ class StepSliceSampler(Sampler):
         return f"{type(self).__name__}(slice_len={self.slice_len}, uniform_over={self.uniform_over!r}{partial})"
 
 
-def _device(storage: Storage) -> torch.device | str:
-    device = getattr(storage, "device", "cpu")
-    return "cpu" if device == "auto" else device
+def _sent(array: np.ndarray, storage: Storage) -> Tensor:
+    """The array on the storage's device; what is queued there is not waited for."""
+    tensor, device = torch.from_numpy(array), getattr(storage, "device", "cpu")
+    if device == "auto":
+        return tensor
+    pinned = torch.device(device).type == "cuda"
+    return (tensor.pin_memory() if pinned else tensor).to(device, non_blocking=pinned)
