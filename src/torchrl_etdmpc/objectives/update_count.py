@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import ReferenceType, WeakKeyDictionary, ref
 
 from torch import Tensor, nn
@@ -14,7 +15,8 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 from torchrl_etdmpc.modules import WorldModel
 
 
-class _Count(NamedTuple):
+@dataclasses.dataclass(eq=False)
+class _Count:
     trained: tuple[nn.Parameter, ...]
     """In the model's order."""
     after: Tensor
@@ -59,7 +61,7 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
 def restart_count(world_model: nn.Module) -> None:
     """Takes a version that was loaded, not counted, as the one to go on from."""
     if world_model in _counts:
-        _counts[world_model] = _counts[world_model]._replace(after=world_model.get_buffer("version").clone())
+        _counts[world_model].after = world_model.get_buffer("version").clone()
 
 
 @functools.cache
@@ -72,7 +74,7 @@ def _count(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) 
         place = count.place(optimizer)
         counting = None if count.counts is None else count.counts()
         if place < len(count.trained) and (optimizer is counting or place <= count.place(counting)):
-            _counts[world_model] = count._replace(counts=ref(optimizer))
+            count.counts = ref(optimizer)
             version = world_model.get_buffer("version")
             version += version != count.after.to(version.device) + 1
             restart_count(world_model)
