@@ -49,6 +49,15 @@ def test_the_models_of_the_package_are_prediction_models(build):
     assert not hasattr(LineWorld(), "bins")
 
 
+def test_a_model_of_action_values_needs_their_number():
+    model = Pendulum()
+    model.action_values = lambda latent, action: latent
+    with pytest.raises(TypeError, match="^world_model must have .*, got Pendulum without num_values; see "):
+        require_prediction_model(model)
+    model.num_values = 2
+    require_prediction_model(model)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_model_of_ones_own_is_planned_over_in_the_dtype_of_its_input(dtype):
     planner = EnsembleMPPIPlanner(LatentEnv(Pendulum(), dtype=dtype), score="final", warm_start=False)

@@ -25,7 +25,7 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | Non
     90.0
     """
     batch = batch.detach().flatten()
-    if batch.dtype != torch.float64:  # torch.quantile takes no half precision
+    if batch.dtype != torch.float64:  # half precision is too coarse for ranks
         batch = batch.float()
     levels = torch.linspace(0.05, 0.95, 2, dtype=batch.dtype, device=batch.device)  # made there, not sent there
     counts = torch.ones_like(batch, dtype=torch.bool) if counts is None else counts.flatten()
