@@ -53,9 +53,9 @@ class RecordedEnv(EnvBase):
     def _write_specs(self, observation_size: int, low: np.ndarray, high: np.ndarray) -> None:
         """The specs, all but those of the flags; ``low`` and ``high`` bound the suite's own actions, float64 [A]."""
         self.observation_spec = Composite(
-            observation=Unbounded(observation_size, dtype=torch.float32),
-            is_init=Binary(1, dtype=torch.bool),
-            episode_reward=Unbounded(1),
+            observation=Unbounded(observation_size, dtype=torch.float32, device=self.device),
+            is_init=Binary(1, dtype=torch.bool, device=self.device),
+            episode_reward=Unbounded(1, device=self.device),
             device=self.device,
         )
         self.reward_spec = Unbounded(1, dtype=torch.float32, device=self.device)
