@@ -5,10 +5,19 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, ExplorationType, RenameTransform, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    ActionScaling,
+    EnvBase,
+    ExplorationType,
+    GymEnv,
+    RenameTransform,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.utils import exploration_type, set_exploration_type
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel
@@ -227,3 +236,17 @@ def test_the_reward_may_have_another_name_and_must_be_one():
     both = TransformedEnv(CountingEnv(3), RenameTransform(["reward"], ["score"], create_copy=True))
     with pytest.raises(ValueError, match=r"^a return is the sum of one reward, .* has \['reward', 'score'\]"):
         evaluate(both, ConstantPolicy(), episodes=1)
+
+
+def test_the_policy_alone_is_compared_with_the_environment_too():
+    env = TransformedEnv(GymEnv("Pendulum-v1"))
+    policy = BarePolicy(WorldModel(3, 1, latent_dim=16, mlp_dim=16))
+    with pytest.raises(ValueError, match=r"bounds of -2 and 2 instead of -1 and 1 \(append ActionScaling\(\)\)"):
+        evaluate(env, policy, episodes=1)
+    with pytest.raises(ValueError, match="observation has 3 entries instead of the model's 4"):
+        evaluate(env, BarePolicy(WorldModel(4, 1, latent_dim=16, mlp_dim=16)), episodes=1)
+    behind = TensorDictSequential(BarePolicy(WorldModel(4, 1, latent_dim=16, mlp_dim=16), observation_key="other"))
+    with pytest.raises(ValueError, match="bounds of -2 and 2"):  # what it reads may come from another module
+        evaluate(env, behind, episodes=1)
+    env.append_transform(ActionScaling())
+    assert evaluate(env, policy, episodes=1).lengths.tolist() == [200]

@@ -139,6 +139,10 @@ _REFUSED = {
         {"action": Box(-3, 3, (2,), np.int64)},
         r"has discrete actions \(dtype int64\); only continuous actions are",
     ),
+    "dictionary of actions": (
+        {"action": Dict(a=Box(-1, 1, (2,)))},
+        r"has actions of type Dict; only one vector of them is supported",
+    ),
     "no bounds": ({"action": Box(-np.inf, np.inf, (2,))}, "has actions without finite bounds, so they cannot be"),
     "half-open": ({"action": Box(0, np.inf, (2,))}, "has actions without finite bounds, so they cannot be"),
     "pixels": (

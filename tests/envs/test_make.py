@@ -323,3 +323,17 @@ def test_signals_stay_held_back_when_the_first_semaphore_is_made():
     )
     process = subprocess.run([sys.executable, "-c", program], text=True, capture_output=True, check=True)
     assert process.stdout.split() == ["True", "set()"]
+
+
+@pytest.mark.parametrize("name", ["pendulum-swingup", "gym/Pendulum-v1"])
+def test_an_environment_plays_whatever_the_default_device_is(name):
+    env = make_env(name, seed=0)
+    action = torch.zeros(1)
+    torch.set_default_device("meta")
+    try:
+        state = env.reset()
+        following = env.step(state.set("action", action))["next"]
+    finally:
+        torch.set_default_device(None)
+    assert {value.device.type for value in following.values(True, True)} == {"cpu"}
+    assert following["episode_reward"].item() == following["reward"].item()

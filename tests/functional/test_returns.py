@@ -203,3 +203,10 @@ def test_bootstrapped_returns_end_where_the_steps_cease_to_count(length):
     counts = (torch.arange(4) < length).unsqueeze(-1).expand(4, 5)
     short = bootstrapped_returns(rewards[:length], values[:length], 0.9)
     torch.testing.assert_close(bootstrapped_returns(rewards, values, 0.9, counts=counts)[:length], short)
+
+
+def test_a_task_without_a_time_limit_has_the_largest_discount():
+    assert discount_from_episode_length(float("inf")) == discount_from_episode_length(1e300) == 0.995
+    assert discount_from_episode_length(float("inf"), discount_max=1.0) == 1.0
+    with pytest.raises(ValueError, match="^decision_steps must be positive, got nan"):
+        discount_from_episode_length(float("nan"))

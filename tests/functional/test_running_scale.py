@@ -111,3 +111,7 @@ def test_half_precision_has_a_scale_too(dtype):
     scale = updated_scale(torch.tensor(1.0, dtype=dtype), torch.linspace(0, 100, 101, dtype=dtype), tau=1.0)
     assert scale.dtype == dtype
     assert scale.item() == pytest.approx(90, abs=1)
+
+
+def test_an_empty_batch_leaves_it_where_it_is():
+    assert updated_scale(torch.tensor(3.0), torch.zeros(0), tau=0.5).item() == 3

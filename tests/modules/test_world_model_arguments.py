@@ -96,3 +96,11 @@ def test_an_encoder_that_acts_differently_in_training_is_refused_unless_it_is_fr
     WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=encoder.eval())
     same = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.0), nn.LSTM(8, 8), nn.LayerNorm(8), nn.GroupNorm(2, 8))
     WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=same)
+
+
+def test_an_observation_of_another_size_is_named():
+    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
+    with pytest.raises(
+        ValueError, match=r"^observations must be of shape \[\.\.\., 3\], got \[5, 4\]; build the world"
+    ):
+        model.encode(torch.zeros(5, 4))

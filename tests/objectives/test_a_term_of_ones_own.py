@@ -11,10 +11,12 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc import EfficientTDMPCLoss, WorldModel
+from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives import (
     LatentRollout,
     LatentRolloutLoss,
     Slices,
+    TDMPC2Loss,
     Term,
     latent_rollout,
 )
@@ -296,3 +298,54 @@ def test_a_scalar_cannot_have_the_name_of_the_loss_s_own(world_model):
 def test_a_coefficient_that_is_not_finite_is_refused(world_model, coef):
     with pytest.raises(ValueError, match=f"reward_coef must be finite, got {coef}"):
         EfficientTDMPCLoss(world_model, discount=0.99, reward_coef=coef)
+
+
+@pytest.mark.parametrize("name", ["loss_mine", "loss_value", "loss_other"])
+def test_a_metric_cannot_take_the_place_of_a_loss(make_loss, name):
+    with pytest.raises(ValueError, match=f"must have names of their own, got '{name}' of the term 'mine'"):
+        make_loss("whole", extra_terms=[Term("mine", full_throttle, metrics=(name,))])
+
+
+@pytest.mark.parametrize("name", ["target_mine", "value_params", "world_model", "terms", "forward"])
+def test_a_term_is_not_called_like_a_part_of_the_loss(make_loss, name):
+    with pytest.raises(ValueError, match=f"^extra_terms must have names of their own, got '{name}'; choose"):
+        make_loss("whole", extra_terms=[Term(name, Reconstruction(16, 5))])
+
+
+def test_the_own_terms_of_a_loss_are_looked_at_like_extra_ones(world_model):
+    twice = [Term("mine", full_throttle), Term("mine", full_throttle, coef=2.0)]
+    with pytest.raises(ValueError, match=r"^terms must have names of their own, got 'mine'; choose another one\.$"):
+        LatentRolloutLoss(world_model, twice)
+    shared = [Term("mine", full_throttle), Term("other", full_throttle, metrics=("mine_error",))]
+    with pytest.raises(ValueError, match="names of their own, got 'mine_error' of the term 'other'"):
+        LatentRolloutLoss(world_model, shared)
+    with pytest.raises(ValueError, match="^terms must have names of their own, got 'value'"):
+        LatentRolloutLoss(world_model, [Term("value", Reconstruction(16, 5))])
+    with pytest.raises(TypeError, match=r"^terms must be a list of Term\(name, function, coef\), got <function"):
+        LatentRolloutLoss(world_model, [full_throttle])
+    reward = Term("reward", full_throttle, networks=("encoder", "policy"))
+    assert LatentRolloutLoss(world_model, [reward])(random_slices(5, 3))["loss_reward"] > 0
+
+
+@pytest.mark.parametrize(
+    ("named", "message"),
+    [
+        ({"networks": ("encoder", "dynamic")}, "networks of the term 'mine' must be some of encoder, .* got 'dynamic'"),
+        ({"networks": "encoder"}, r"networks of the term 'mine' must be a tuple of names, .* write \('encoder',\)"),
+        ({"targets": ("valu",)}, "targets of the term 'mine' must be some of encoder, .*, got 'valu'"),
+        ({"targets": ("policy",)}, "the target 'policy' of the term 'mine' is of a network that no term trains"),
+        ({"keys": "bonus"}, r"keys of the term 'mine' must be a tuple of names, got 'bonus'; write \('bonus',\)"),
+        ({"metrics": "norm"}, "metrics of the term 'mine' must be a tuple of names, got 'norm'"),
+    ],
+)
+def test_a_network_or_a_key_that_is_not_there_is_refused(world_model, named, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        LatentRolloutLoss(world_model, [Term("mine", full_throttle, **named)])
+
+
+@pytest.mark.parametrize("name", ["consistency", "reward", "value", "policy", "entropy"])
+def test_a_coefficient_of_the_method_is_not_negative(world_model, name):
+    with_actions = ActionValueWorldModel(5, 3, latent_dim=16, mlp_dim=16)
+    for kind, model in ((EfficientTDMPCLoss, world_model), (TDMPC2Loss, with_actions)):
+        with pytest.raises(ValueError, match=rf"^{name}_coef must not be negative, got -1\.0; 0 leaves"):
+            kind(model, discount=0.99, **{f"{name}_coef": -1.0})

@@ -231,3 +231,11 @@ def test_half_precision_leaves_the_discount_as_it_is():
     assert torch.isfinite(loss(batch.apply(lambda x: x.bfloat16() if x.is_floating_point() else x))["loss_value"])
     for dtype in (torch.float64, torch.float32):
         assert loss.to(dtype).discount.dtype == dtype
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_no_slices_at_all_are_refused(make_loss, training):
+    loss = make_loss("whole").train(training)
+    batch = random_slices(5, 3)[:0]
+    with pytest.raises(ValueError, match=r"needs at least one step, got \[0, 3\] slices\.$"):
+        loss(batch)

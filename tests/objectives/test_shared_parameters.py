@@ -7,6 +7,8 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
+from torchrl_etdmpc import EfficientTDMPCLoss
+
 
 def _identities(module):
     return {id(parameter) for parameter in module.parameters()}
@@ -184,3 +186,20 @@ def test_a_world_model_that_was_cast_without_its_loss_is_noticed(make_loss, slic
     ):
         loss(slices.double())
     loss.double()(slices.double())
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        ({"num_dynamics": 3}, r"dynamics_params\.hidden\.0\.weight is \[2, .*\] there and \[3, .*\] here, and 11 more"),
+        ({"normalize_observations": True}, r"it lacks encoder_params\.norm\.mean, and 2 more"),
+    ],
+)
+def test_a_state_of_another_world_model_is_refused_before_anything_is_loaded(make_world_model, options, fault):
+    state = EfficientTDMPCLoss(make_world_model(num_dynamics=2), discount=0.99).state_dict()
+    other = EfficientTDMPCLoss(make_world_model(**({"num_dynamics": 2} | options)), discount=0.99)
+    before = copy.deepcopy(other.state_dict())
+    with pytest.raises(RuntimeError, match=rf"^the state is of another world model: {fault}; build this one like"):
+        other.load_state_dict(state)
+    for name, value in other.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0, msg=name)

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel
+from torchrl_etdmpc import EfficientTDMPCLoss, EnsembleMPPIPlanner, LatentEnv, WorldModel
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.testing import LineWorld
 
@@ -141,3 +141,17 @@ def test_a_generator_draws_for_the_entries_whatever_the_batch_size_says():
         for size in ([], data.batch_size)
     ]
     assert torch.equal(*drawn)
+
+
+def test_specs_follow_a_world_model_that_its_loss_casts_or_moves():
+    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
+    planner = EnsembleMPPIPlanner(LatentEnv(model), horizon=2, num_samples=8, num_elites=4, num_proposals=2)
+    EfficientTDMPCLoss(model, discount=0.99).to(torch.float64)
+    assert planner.action_spec.dtype == torch.float64
+    assert planner.spec["action"].dtype == planner.spec["plan", "loc"].dtype == torch.float64
+    latent = LatentEnv(model)
+    model.float()
+    reset = latent.reset(TensorDict(observation=torch.zeros(3)))
+    assert reset["latent"].dtype == latent.observation_spec["latent"].dtype == torch.float32
+    model.to("meta")  # in the place of a GPU
+    assert planner.spec["action"].device.type == planner.spec["plan", "loc"].device.type == "meta"

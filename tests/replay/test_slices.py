@@ -840,3 +840,19 @@ def test_a_full_buffer_is_rolled_back_in_the_process_that_filled_it(how, tmp_pat
     with pytest.raises(RuntimeError, match="others have written to the full storage"):
         buffer.storage.set(0, buffer.storage[0])
         buffer.sample()
+
+
+@pytest.mark.parametrize("capacity", [60, 50])
+def test_rows_are_drawn_whatever_the_default_device_is(capacity):
+    rows = TensorDict({"t": torch.arange(60), "collector": {"traj_ids": torch.arange(60) // 20}}, [60])
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity, device="cpu"), sampler=StepSliceSampler(3), batch_size=6
+    )
+    torch.set_default_device("meta")
+    try:
+        buffer.extend(rows[:50])
+        buffer.extend(rows[50:])  # goes round in the smaller one
+        drawn = buffer.sample()["t"].reshape(2, 3)
+    finally:
+        torch.set_default_device(None)
+    assert (drawn.diff(dim=1) == 1).all()

@@ -79,12 +79,15 @@ def evaluate(
 
 
 def fitting_primers(env: EnvBase, policy: nn.Module) -> list[TensorDictPrimer]:
-    """The primers of the policy and of the modules in it; one that knows what its model takes compares it first.
+    """The primers of the policy and of the modules in it; what knows what its model takes compares it first.
 
     Raises:
         ValueError: if environment and model do not fit.
     """
-    modules: Iterable[Any] = policy.modules() if isinstance(policy, nn.Module) else [policy]
+    modules: list[Any] = [*policy.modules()] if isinstance(policy, nn.Module) else [policy]
+    for part in modules:
+        if hasattr(part, "check_env"):
+            part.check_env(env, alone=part is policy)
     parts = [part for part in modules if hasattr(part, "make_tensordict_primer")]
     primers = [part.make_tensordict_primer() for part in parts]
     for part, primer in zip(parts, primers, strict=True):
@@ -104,8 +107,9 @@ def _round(
     observed = env.observation_spec.keys(include_nested=True, leaves_only=True)
     reward, done = env.reward_keys[0], next(key for key in env.done_keys if "done" in (key, key[-1]))
     tensordict = env.reset()
-    total, length = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.int64)
-    running = torch.ones(num_envs, dtype=torch.bool)
+    total = torch.zeros(num_envs, device="cpu")  # whatever the default device is
+    length = torch.zeros_like(total, dtype=torch.int64)
+    running = torch.ones_like(total, dtype=torch.bool)
     while running.any():
         if policy_device is None:
             tensordict = policy(tensordict)

@@ -208,7 +208,7 @@ class StepCollector(BaseCollector):
         return tensordict.update(outputs)
 
     def _start(self, tensordict: TensorDictBase) -> TensorDictBase:
-        ids = torch.arange(self.num_envs) + self._next_trajectory
+        ids = torch.arange(self.num_envs, device="cpu") + self._next_trajectory
         self._next_trajectory += self.num_envs
         return tensordict.set(TRAJECTORY, ids.reshape(tensordict.batch_size))
 

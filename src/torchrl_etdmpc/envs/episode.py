@@ -64,9 +64,11 @@ class RecordedEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._random, self._actions = self._random_state(**kwargs), []
-        self._episode_reward = torch.zeros(1)
+        self._episode_reward = torch.zeros(1, device="cpu")  # whatever the default device is
         first = super()._reset(tensordict, **kwargs)
-        return first.update({"is_init": torch.ones(1, dtype=torch.bool), "episode_reward": self._episode_reward})
+        return first.update(
+            {"is_init": torch.ones_like(self._episode_reward, dtype=torch.bool), "episode_reward": self._episode_reward}
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._middle + self._half_width * tensordict.get(self.action_key).numpy(force=True)  # float64
@@ -80,7 +82,7 @@ class RecordedEnv(EnvBase):
         return TensorDict(
             self.read_obs(observation)
             | {"reward": reward, "episode_reward": self._episode_reward}
-            | {name: torch.full((1,), bool(flag)) for name, flag in flags.items()},
+            | {name: torch.full((1,), bool(flag), device="cpu") for name, flag in flags.items()},
             batch_size=self.batch_size,
             device=self.device,
         )
@@ -94,7 +96,7 @@ class RecordedEnv(EnvBase):
             total += reward
             if terminated or truncated:
                 break
-        reward = torch.tensor([total], dtype=torch.float32)
+        reward = torch.tensor([total], dtype=torch.float32, device="cpu")
         self._episode_reward = self._episode_reward + reward
         return observation, reward, terminated, truncated
 

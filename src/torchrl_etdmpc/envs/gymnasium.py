@@ -140,13 +140,15 @@ def _quiet_mujoco() -> Iterator[None]:
 
 def _require_vectors(name: str, env: Any) -> None:
     """Refuses in one line what cannot be turned into a vector of the right kind without guessing."""
-    from gymnasium.spaces import Box
+    from gymnasium.spaces import Box, Dict, Tuple
 
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, Box):
         raise ValueError(f"{name} has observations of type {type(observations).__name__}; only vectors are supported.")
     if observations.dtype == np.uint8 and len(observations.shape) > 1 or len(observations.shape) == 3:
         raise ValueError(f"{name} has pixel observations {list(observations.shape)}; only vectors are supported.")
+    if isinstance(actions, Dict | Tuple):
+        raise ValueError(f"{name} has actions of type {type(actions).__name__}; only one vector of them is supported.")
     if not isinstance(actions, Box) or not np.issubdtype(actions.dtype, np.floating):
         kind = type(actions).__name__ if not isinstance(actions, Box) else f"dtype {actions.dtype}"
         raise ValueError(f"{name} has discrete actions ({kind}); only continuous actions are supported.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -91,7 +93,7 @@ def discount_from_episode_length(
     ``clip((T / 5 - 1) / (T / 5), discount_min, discount_max)`` with T the episode length in decision steps.
 
     Args:
-        decision_steps (float): episode length T in decision steps, positive.
+        decision_steps (float): episode length T in decision steps, positive; infinite without a time limit.
         discount_min (float): lower bound.
         discount_max (float): upper bound.
         denominator (float): the 5 of the formula.
@@ -105,9 +107,10 @@ def discount_from_episode_length(
     >>> discount_from_episode_length(500)
     0.99
     """
-    if decision_steps <= 0:
+    if not decision_steps > 0:
         raise ValueError(
             f"decision_steps must be positive, got {decision_steps}; pass the episode length in decisions."
         )
     fraction = decision_steps / denominator
-    return min(max((fraction - 1) / fraction, discount_min), discount_max)
+    discount = 1.0 if math.isinf(fraction) else (fraction - 1) / fraction
+    return min(max(discount, discount_min), discount_max)

@@ -25,6 +25,8 @@ def updated_scale(scale: Tensor, batch: Tensor, tau: float, counts: Tensor | Non
     90.0
     """
     batch = batch.detach().flatten()
+    if not batch.numel():
+        return scale
     if batch.dtype != torch.float64:  # half precision is too coarse for ranks
         batch = batch.float()
     levels = torch.linspace(0.05, 0.95, 2, dtype=batch.dtype, device=batch.device)  # made there, not sent there

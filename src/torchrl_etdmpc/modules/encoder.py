@@ -27,6 +27,7 @@ class Encoder(LayerStack):
 
     Raises:
         TypeError: if an observation has another dtype than the weights.
+        ValueError: if it has another size than O.
 
     >>> Encoder(24, 512)(torch.zeros(2, 24)).shape
     torch.Size([2, 512])
@@ -50,6 +51,7 @@ class Encoder(LayerStack):
             activation=activation,
             output_activation=partial(simnorm, group_size=simnorm_dim),
         )
+        self.observation_dim = observation_dim
         self.norm = RunningNorm(observation_dim) if normalize else None
 
     def reset_parameters_recursive(self) -> None:
@@ -78,5 +80,10 @@ class Encoder(LayerStack):
                 f"observations are {observation.dtype} and the weights {dtype}; append torchrl.envs."
                 f"DTypeCastTransform({observation.dtype}, {dtype}) to the environment, or cast one of the two with "
                 ".to(dtype)."
+            )
+        if observation.shape[-1:] != (self.observation_dim,):
+            raise ValueError(
+                f"observations must be of shape [..., {self.observation_dim}], got {list(observation.shape)}; build "
+                "the world model with their size, or flatten them."
             )
         return self.through(observation if self.norm is None else self.norm(observation))

@@ -13,7 +13,7 @@ from torch.func import functional_call
 from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Term
+from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Term, require_not_negative
 
 
 def draw_two_heads(num_heads: int, device: torch.device) -> Tensor:
@@ -130,12 +130,13 @@ def action_value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value
 
     Raises:
         TypeError: if the world model has no action values.
-        ValueError: if the discount is out of range.
+        ValueError: if the coefficient or the discount is out of range.
     """
     if not isinstance(world_model, ActionValueWorldModel):
         raise TypeError(
             f"world_model must have action values, got {type(world_model).__name__}; build an ActionValueWorldModel."
         )
+    require_not_negative(value_coef=value_coef)
     if not 0 < discount <= 1:
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
     return Term(

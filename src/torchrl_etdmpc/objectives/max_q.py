@@ -13,7 +13,7 @@ from torchrl_etdmpc.functional import gaussian_entropy, tanh_log_slope, two_hot_
 from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives.action_value import draw_two_heads
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Term
+from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Term, require_not_negative
 
 
 class PolicyValue(NamedTuple):
@@ -88,7 +88,12 @@ def register_q_scale(loss: LatentRolloutLoss, scale_tau: float) -> None:
 
 
 def max_q_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float, squashed_entropy: bool) -> Term:
-    """The term of the policy, for any loss with a running scale of action values."""
+    """The term of the policy, for any loss with a running scale of action values.
+
+    Raises:
+        ValueError: if a coefficient is negative.
+    """
+    require_not_negative(policy_coef=policy_coef, entropy_coef=entropy_coef)
     return Term(
         "policy",
         partial(_max_q, loss, squashed_entropy),

@@ -17,7 +17,7 @@ from torchrl_etdmpc.objectives.latent_rollout import (
     head_rows,
     mean_of_head_rows,
 )
-from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term, require_not_negative
 
 _DIRECTIONS = get_args(KLDirection)
 
@@ -130,7 +130,12 @@ def _check_direction(kl_direction: str) -> None:
 
 
 def policy_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float) -> Term:
-    """The term of the policy, for any loss with a running scale."""
+    """The term of the policy, for any loss with a running scale.
+
+    Raises:
+        ValueError: if a coefficient is negative.
+    """
+    require_not_negative(policy_coef=policy_coef, entropy_coef=entropy_coef)
     return Term(
         "policy",
         partial(_policy, loss),

@@ -147,7 +147,8 @@ class LatentRolloutLoss(LossModule):
 
     Networks stay shared with the world model that was passed: the planner that holds it sees every update. Every step
     of a PyTorch optimiser that trains them counts as one in ``world_model.version``, which dates the planner's targets
-    and is part of this loss' state.
+    and is part of this loss' state. So are the coefficients and the discount, as with TorchRL's losses: whoever loads a
+    state takes them over, while options that are plain numbers (``value_beta``, ``scale_tau``) stay as constructed.
 
     Padded steps count for nothing: not in losses, gradients, running scale or metrics. The mask is found as TorchRL's
     losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
@@ -176,7 +177,8 @@ class LatentRolloutLoss(LossModule):
 
     Raises:
         TypeError: if a term is not a :class:`Term`.
-        ValueError: if an argument is out of range, or two names of terms, coefficients or metrics are the same.
+        ValueError: if an argument is out of range, a term names a network that there is not, or two names of terms,
+            coefficients or metrics are the same.
 
     >>> from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss
     >>> from torchrl_etdmpc.testing import random_slices
@@ -277,10 +279,11 @@ class LatentRolloutLoss(LossModule):
         _check_reduction(self.reduction)
         if not 0 < rho <= 1:
             raise ValueError(f"rho must be in (0, 1], got {rho}.")
-        _check_terms(terms, extra_terms, taken=self._attributes)
         vars(self)["world_model"] = world_model
-        self._trained = {}
+        self.ignore_termination = ignore_termination
         self.terms = (*terms, *extra_terms)
+        _check_terms(self, terms, extra_terms)
+        self._trained = {}
         trained = {name for term in self.terms for name in term.networks}
         followed = {name for term in self.terms for name in term.targets}
         for name, attribute in self._attributes.items():
@@ -298,7 +301,6 @@ class LatentRolloutLoss(LossModule):
             if isinstance(term.function, nn.Module):
                 self.add_module(term.name, term.function)
         self.register_buffer("rho", torch.tensor(float(rho), device=device))
-        self.ignore_termination = ignore_termination
         self.distill = True
         count_updates(world_model, self.parameters())
 
@@ -363,11 +365,29 @@ class LatentRolloutLoss(LossModule):
         destination[f"{prefix}version"] = self.world_model.version.detach()
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self._refuse_other_networks({k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)})
         version = state_dict.get(f"{prefix}version")
         super()._load_from_state_dict({k: v for k, v in state_dict.items() if k != f"{prefix}version"}, prefix, *args)
         if version is not None:  # files of before do not have it
             self.world_model.version.copy_(version)
             restart_count(self.world_model)
+
+    def _refuse_other_networks(self, state: Mapping[str, Any]) -> None:
+        """Raises before anything is overwritten; a tensordict that does not fit says nothing of where."""
+        own = {name: value for name, value in self.state_dict().items() if "_params." in name}
+        networks = {name.partition(".")[0] for name in own} & {name.partition(".")[0] for name in state}
+        given = {name: value for name, value in state.items() if name.partition(".")[0] in networks}
+        faults = [
+            f"{name} is {list(given[name].shape)} there and {list(value.shape)} here"
+            if name in given
+            else f"it lacks {name}"
+            for name, value in own.items()
+            if name.partition(".")[0] in networks and (name not in given or given[name].shape != value.shape)
+        ]
+        faults += [f"it has {name}" for name in given if name not in own]
+        if faults:
+            more = f", and {len(faults) - 1} more" if faults[1:] else ""
+            raise RuntimeError(f"the state is of another world model: {faults[0]}{more}; build this one like that one.")
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones.
@@ -451,7 +471,8 @@ class LatentRolloutLoss(LossModule):
             tensordict (TensorDictBase): batch size [B, T].
 
         Raises:
-            ValueError: if an entry is not of shape [B, T, features] (one that the encoder owns: [B, T, ...]), or
+            ValueError: if the batch is empty, an entry is not of shape [B, T, features] (one that the encoder owns:
+                [B, T, ...]), or
                 a row of a CPU tensor terminates although the world model has no termination head. Elsewhere that
                 check would wait for the device, and under ``torch.compile`` it cannot be made: it is skipped.
             KeyError: if a key is missing.
@@ -464,6 +485,10 @@ class LatentRolloutLoss(LossModule):
         for name, entry in entries.items():
             if entry.shape[:2] != entries["action"].shape[:2]:  # it would be spread over the batch, or fail elsewhere
                 raise self._shape_error(reads[name], entry)
+        if 0 in entries["action"].shape[:2]:
+            raise ValueError(
+                f"{type(self).__name__} needs at least one step, got {list(tensordict.batch_size)} slices."
+            )
         counts = self._counted_steps(tensordict, entries["action"].shape[:2])
         self._refuse_termination(tensordict, counts)
         self._refuse_gaps(tensordict, counts, entries["action"].shape[:2])
@@ -727,22 +752,60 @@ def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> 
     return torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))
 
 
-def _check_terms(terms: Sequence[Term], extra_terms: Sequence[Term], taken: Iterable[str]) -> None:
-    """Raises where a name of a term, a number or a metric is there twice."""
-    names: set[str] = {*taken, "rho"}
-    for term in terms:
-        names |= {term.name, f"{term.name}_coef", *term.scalars, *term.metric_names}
-    for term in extra_terms:
-        if not isinstance(term, Term):
-            raise TypeError(f"extra_terms must be a list of Term(name, function, coef), got {term!r} in it.")
-        own, further = [term.name, f"{term.name}_coef"], [*term.scalars, *term.metric_names]
-        if any(name in names or hasattr(LatentRolloutLoss, name) for name in own) or not term.name.isidentifier():
-            raise ValueError(f"extra_terms must have names of their own, got {term.name!r}; choose another one.")
-        for name in further:
-            if name in names or hasattr(LatentRolloutLoss, name):
+def require_not_negative(**coefs: float) -> None:
+    """Raises a ``ValueError`` where a coefficient of the method's own terms is below 0: it would train away from it."""
+    for name, coef in coefs.items():
+        if coef < 0:
+            raise ValueError(f"{name} must not be negative, got {coef}; 0 leaves the term out of the sum.")
+
+
+def _check_terms(loss: LatentRolloutLoss, terms: Sequence[Term], extra_terms: Sequence[Term]) -> None:
+    """Raises where a term is of another kind than stated, a name is there twice, or a network is not known."""
+    networks = loss._attributes
+    for argument, own in (("terms", terms), ("extra_terms", extra_terms)):
+        for term in own:
+            if not isinstance(term, Term):
+                raise TypeError(f"{argument} must be a list of Term(name, function, coef), got {term!r} in it.")
+            _check_networks(term, networks)
+    taken, trained = {"rho"}, {name for term in (*terms, *extra_terms) for name in term.networks}
+    for argument, own in (("terms", terms), ("extra_terms", extra_terms)):
+        for term in own:
+            named_after = argument == "terms" and term.name in networks and not isinstance(term.function, nn.Module)
+            if not term.name.isidentifier() or any(
+                _is_taken(loss, name, taken, () if named_after else networks)
+                for name in (term.name, f"{term.name}_coef")
+            ):
+                raise ValueError(f"{argument} must have names of their own, got {term.name!r}; choose another one.")
+            taken |= {term.name, f"{term.name}_coef"}
+            for name in (*term.scalars, *term.metric_names):
+                if _is_taken(loss, name, taken, networks) or name.startswith("loss_"):
+                    raise ValueError(
+                        f"metrics and scalars must have names of their own, got {name!r} of the term {term.name!r}; "
+                        "choose another one."
+                    )
+                taken.add(name)
+            idle = [name for name in term.targets if name not in trained]
+            if idle:
                 raise ValueError(
-                    f"metrics and scalars must have names of their own, got {name!r} of the term {term.name!r}; choose "
-                    "another one."
+                    f"the target {idle[0]!r} of the term {term.name!r} is of a network that no term trains."
                 )
-        new = own + further
-        names.update(new)
+
+
+def _check_networks(term: Term, networks: Mapping[str, str]) -> None:
+    for argument in ("networks", "targets", "keys", "metrics"):
+        names = getattr(term, argument)
+        if isinstance(names, str):
+            raise ValueError(
+                f"{argument} of the term {term.name!r} must be a tuple of names, got {names!r}; write ({names!r},)."
+            )
+        unknown = [] if argument in ("keys", "metrics") else [name for name in names if name not in networks]
+        if unknown:
+            raise ValueError(
+                f"{argument} of the term {term.name!r} must be some of {', '.join(networks)}, got {unknown[0]!r}."
+            )
+
+
+def _is_taken(loss: LatentRolloutLoss, name: str, taken: Iterable[str], networks: Iterable[str]) -> bool:
+    """Whether the loss has, or may get, something else of that name."""
+    special = name.startswith("target_") or name.endswith("_params")
+    return special or name in taken or name in networks or name in vars(loss) or hasattr(type(loss), name)

@@ -19,7 +19,7 @@ from torchrl_etdmpc.functional import (
 )
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term, require_not_negative
 
 
 @torch.no_grad()
@@ -232,13 +232,14 @@ def value_term(
 
     Raises:
         TypeError: if the value heads read actions.
-        ValueError: if the discount or an option of the targets is out of range.
+        ValueError: if the coefficient, the discount or an option of the targets is out of range.
     """
     if isinstance(world_model, ActionValueWorldModel):
         raise TypeError(
             f"world_model must have state values, got {type(world_model).__name__}; train its action values with "
             "TDMPC2Loss."
         )
+    require_not_negative(value_coef=value_coef)
     if not 0 < discount <= 1:
         raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
     if not 0 <= value_beta < math.inf:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl_etdmpc.functional import two_hot_cross_entropy
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term, require_not_negative
 
 
 def consistency_error(rollout: LatentRollout) -> Tensor:
@@ -139,7 +139,12 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
 def model_terms(
     world_model: WorldModel, *, consistency_coef: float, reward_coef: float, termination_coef: float
 ) -> list[Term]:
-    """The terms of the world model; that of the termination only where it has a head for it."""
+    """The terms of the world model; that of the termination only where it has a head for it.
+
+    Raises:
+        ValueError: if a coefficient is negative.
+    """
+    require_not_negative(consistency_coef=consistency_coef, reward_coef=reward_coef, termination_coef=termination_coef)
     rolled = ("encoder", "dynamics")
     terms = [
         Term("consistency", _consistency, consistency_coef, networks=rolled),

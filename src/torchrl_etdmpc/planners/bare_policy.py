@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from typing import Any
 
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from torchrl_etdmpc.envs.check import check_spaces, model_sizes
 from torchrl_etdmpc.keys import ACTION, OBSERVATION
 from torchrl_etdmpc.modules import PolicyModel
 from torchrl_etdmpc.modules.prediction import require_policy
@@ -41,6 +45,26 @@ class BarePolicy(TensorDictModuleBase):
         self.world_model = require_policy(world_model, "BarePolicy")
         self.in_keys = [observation_key]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [action_key]  # pyright: ignore[reportAttributeAccessIssue]
+
+    def check_env(self, env: EnvBase, *, alone: bool = True) -> None:
+        """Raises a ``ValueError`` that says what to append if an environment does not fit the model.
+
+        :func:`~torchrl_etdmpc.collectors.evaluate` and :class:`~torchrl_etdmpc.collectors.StepCollector` ask it.
+
+        Args:
+            env (EnvBase): the environment.
+
+        Keyword Args:
+            alone (bool): whether this is the whole policy, so that what the environment lacks is a fault. Default:
+                ``True``.
+        """
+        sizes: dict[str, Any] = model_sizes(self.world_model)
+        observation, action = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
+        if not alone and observation not in env.full_observation_spec.keys(True, True):
+            sizes["observation_dim"] = None
+        if not alone and action not in env.action_keys:
+            sizes["action_dim"] = None
+        check_spaces(env, **sizes, observation_key=observation, action_key=action)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

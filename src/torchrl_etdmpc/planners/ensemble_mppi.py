@@ -235,6 +235,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     @property
     def action_spec(self) -> Bounded:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Of the world model's actions, where the world model is now."""
+        self.env.follow()
         return self.env.action_spec  # pyright: ignore[reportReturnType]
 
     @action_spec.setter

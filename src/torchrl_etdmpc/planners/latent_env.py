@@ -68,15 +68,21 @@ class LatentEnv(ModelBasedEnvBase):
         super()._apply(fn, *args, **kwargs)
         device, dtype = self.device_and_dtype()
         like = fn(torch.empty(0, device=device, dtype=dtype))  # where a model without parameters goes
-        device, dtype = device_and_dtype(self.world_model, like.device, like.dtype)
-        for specs in ("_input_spec", "_output_spec"):  # those of the flags too
-            if specs in vars(self):
-                vars(self)[specs] = vars(self)[specs].to(device)
-        self._set_specs(device, dtype)
+        self._set_specs(*device_and_dtype(self.world_model, like.device, like.dtype))
         return self
+
+    def follow(self) -> None:
+        """Brings the specs to where the world model is now, which may have been moved or cast by who shares it."""
+        device, dtype = self.device_and_dtype()
+        spec = self.observation_spec[LATENT]
+        if (spec.device, spec.dtype) != (device, dtype):
+            self._set_specs(device, dtype)
 
     def _set_specs(self, device: torch.device, dtype: torch.dtype) -> None:
         """Specs of a world model that is here, in this dtype."""
+        for specs in ("_input_spec", "_output_spec"):  # those of the flags too
+            if specs in vars(self):
+                vars(self)[specs] = vars(self)[specs].to(device)
         model, like = self.world_model, {"device": device, "dtype": dtype}
         self._device = device
         self.empty_cache()
@@ -100,6 +106,8 @@ class LatentEnv(ModelBasedEnvBase):
 
         A model that encodes what it likes starts from an all-zero latent then.
         """
+        if not torch.compiler.is_compiling():
+            self.follow()
         model = self.world_model
         observation = None if tensordict is None else tensordict.get(self.observation_key, None)
         if tensordict is None or (LATENT not in tensordict.keys() and observation is None):

@@ -158,7 +158,9 @@ class StepSliceSampler(Sampler):
         total = int(counts.sum())
         if total == 0:
             raise RuntimeError(self._nothing_to_sample(storage, first))
-        draws = torch.rand(2, batch_size // self.slice_len, dtype=torch.float64, generator=self._rng).numpy()
+        draws = torch.rand(
+            2, batch_size // self.slice_len, dtype=torch.float64, generator=self._rng, device="cpu"
+        ).numpy()
         if self.uniform_over == "episodes":
             eligible = np.flatnonzero(counts)
             chosen = eligible[(draws[0] * len(eligible)).astype(np.int64)]
@@ -296,7 +298,8 @@ class StepSliceSampler(Sampler):
             )
         low, number = begin % storage.max_size, self._written - begin
         around = low + number > storage.max_size
-        index = torch.arange(low, low + number) % storage.max_size if around else slice(low, low + number)
+        rows = torch.arange(low, low + number, device="cpu")  # whatever the default device is
+        index = rows % storage.max_size if around else slice(low, low + number)
         values: dict[NestedKey, Any] = {}
         for key in (*keys, self.init_key, self.done_key, self.mask_key):
             column = stored.get(key, None)
