@@ -178,6 +178,9 @@ def report(ours: list[Path]) -> str:
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
     figure.savefig(FOLDER / "race.png", dpi=150)
     lines = ["# By the clock", "", *__doc__.split("\n\n")[-1].splitlines(), ""]
+    ran = {run.path.relative_to(FOLDER).parts[0] for run in runs if run.path.is_relative_to(FOLDER)}
+    missing = [f"{a}-{s}" for a in ALGORITHMS for s in SETTINGS if f"{a}-{s}" not in ran]
+    lines += [f"Not run yet: {', '.join(missing)}.", ""] if missing else []
     lines += ["| task | method | seeds | return at 50,000 env steps | minutes until then | last return | minutes |"]
     lines += ["|---" * 7 + "|"]
     for (task, method), rows in found.groupby(["task", "method"]):

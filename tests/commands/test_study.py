@@ -185,3 +185,22 @@ def test_episodes_that_end_early_count_as_long_as_they_were(tmp_path, study):
     assert all(abs(float(row["gain"])) < 100 for row in true)
     assert "value_bias: left out" not in out
     assert "advantage: left out" not in out
+
+
+@pytest.mark.parametrize(
+    ("out", "error"),
+    [
+        ("notes.txt", "error: notes.txt is a file; name a folder."),
+        ("/proc/study", "error: /proc/study cannot be written (No such file or directory); choose another path."),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_an_error_before_the_episodes(study, checkpoint, tmp_path, out, error):
+    (tmp_path / "notes.txt").write_text("mine")
+    message, said, _ = study("value_bias", f"checkpoint={checkpoint}", *FEW, f"out={out}")
+    assert message == error
+    assert said == ""
+
+
+def test_one_episode_has_no_interval_and_says_so(study, checkpoint):
+    _, said, _ = study("value_bias", f"checkpoint={checkpoint}", "episodes=1", "states=4", "device=cpu", "out=out")
+    assert "intervals are over whole episodes, so they are nan; episodes=2 is the least that has some" in said

@@ -271,6 +271,11 @@ def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
         (["experiment=none.yaml"], "experiment=none.yaml is not a file."),
         ([], "experiment=... is missing: the name of an experiment; `suite list` lists them."),
         (["status"], "experiment=... is missing"),
+        (["status", "runs_dir=none"], "runs_dir=none holds no experiment; begin it with experiment=NAME."),
+        (
+            ["experiment=cpu-easy", "seeds=0"],
+            "seeds of this call must be a list of numbers or how many, at least 1, got 0",
+        ),
         (["status", "experiment=cpu-easy"], "runs_dir={here}/runs/cpu-easy holds no experiment; begin it, or name its"),
         (
             ["stauts", "experiment=cpu-easy"],
@@ -315,7 +320,7 @@ def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
         ),
         (
             ["experiment=cpu-easy", "seeds=x"],
-            "seeds of {experiments}/cpu-easy.yaml must be a list of numbers or how many",
+            "seeds of this call must be a list of numbers or how many, at least 1, got 'x'.",
         ),
         (["experiment=cpu-easy", "variants=gpu"], "variants must be some of cpu, got 'gpu'."),
         (

@@ -227,6 +227,9 @@ def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, sa
         (["checkpoint=GOOD", "planner.horizn=4"], "unknown setting planner.horizn; did you mean planner.horizon?"),
         (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4 or .gif, got 'film.avi'."),
         (["checkpoint=GOOD", "video=noise.pt/film.mp4"], "noise.pt/film.mp4 cannot be written (File exists); choose "),
+        (["checkpoint=GOOD", "csv=folder.csv"], "folder.csv is a folder; name a file."),
+        (["checkpoint=GOOD", "video=folder.mp4"], "folder.mp4 is a folder; name a file."),
+        (["checkpoint=GOOD", "csv=/proc/a.csv"], "/proc/a.csv cannot be written ("),
         (["checkpoint=GOOD", "csv=a.txt"], "csv must end in .csv, got 'a.txt'."),
         (["checkpoint=GOOD", "csv=noise.pt/b/a.csv"], "noise.pt/b/a.csv cannot be written (Not a directory); choose "),
         (["checkpoint=GOOD", "epsiodes=2"], "unknown setting epsiodes; did you mean episodes?"),
@@ -237,11 +240,13 @@ def test_a_bad_input_ends_in_one_line(tmp_path, monkeypatch, checkpoint, run_mai
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     (tmp_path / "noise.pt").write_bytes(b"\x80\x02noise")
     torch.save({"weight": torch.ones(3)}, tmp_path / "other.pt")
+    for folder in ("folder.csv", "folder.mp4"):
+        (tmp_path / folder).mkdir()
     error, out, err = run_main(*(argument.replace("GOOD", str(checkpoint)) for argument in arguments))
     assert error.startswith("error: " + message.replace("GOOD", str(checkpoint)))
     assert "\n" not in error
     assert (out, err) == ("", "")
-    assert {path.name for path in tmp_path.iterdir()} == {"noise.pt", "other.pt"}
+    assert {path.name for path in tmp_path.iterdir()} == {"noise.pt", "other.pt", "folder.csv", "folder.mp4"}
 
 
 def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, monkeypatch, checkpoint, run_main):

@@ -98,6 +98,7 @@ def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, save_untrained
             ["state=replay:0", "save=page"],
             "error: state cannot be a row of the replay buffer: this checkpoint has none",
         ),
+        (["save=/proc/page"], "error: /proc/page cannot be written (No such file or directory); choose another path."),
         (["planner.num_elites=99"], "error: planner.num_elites must be at most num_samples=12, got 99."),
         (["planner.horizn=3"], "error: unknown setting planner.horizn; did you mean planner.horizon?"),
         (["host=0.0.0.0"], "error: host must be this machine's own address, 127.0.0.1, got '0.0.0.0'"),

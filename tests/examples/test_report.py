@@ -446,6 +446,21 @@ def test_a_file_in_the_place_of_the_report_is_named(refused):
     assert refused("runs", "--out", "notes.txt") == "--out=notes.txt is a file; name a folder."
 
 
+def test_a_report_that_cannot_be_written_is_named(refused):
+    make_run("runs/a")
+    assert refused("runs", "--out", "/proc/report") == (
+        "/proc/report cannot be written (No such file or directory); choose another path."
+    )
+
+
+def test_an_option_that_is_written_like_a_setting_is_answered(refused):
+    make_run("runs/a")
+    assert refused("runs", "out=elsewhere") == (
+        "out=elsewhere would call runs 'out'; an option is written --out elsewhere."
+    )
+    assert refused("runs", "grid-step=10").endswith("an option is written --grid-step 10.")
+
+
 def test_one_broken_run_is_skipped_and_named(run_main, capfd):
     make_run("runs/a")
     make_run("runs/b", seed=2, text=HEADER + "0,0,7,1.0,much,0.5,10\n")

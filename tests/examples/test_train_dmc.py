@@ -194,6 +194,7 @@ REFUSED = [
     ("optim.lr=0", "optim.lr must be positive, got 0.0."),
     ("total_env_steps=5000", "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise "),
     ("replay.capacity=2", "replay.capacity must be at least 6 with these settings, got 2."),
+    ("workers=2", "unknown setting workers; the command distributed has it."),
     ("num_envs=0", "num_envs must be at least 1, got 0."),
     ("resume=true", "run_dir=runs/walker-walk/efficient-tdmpc/seed1 holds no run to go on with; start it with "),
     ("logger=wandb", "logger=wandb needs wandb, which is not installed; run `pip install wandb`."),

@@ -104,10 +104,10 @@ def test_settings_of_the_command_come_after_those_of_every_variant(write):
             {"tasks": ["cup-catch", "cup-catch"]},
             "tasks of experiment mine must differ, got .'cup-catch'. more than once",
         ),
-        ({"seeds": 0}, "seeds of .*mine.yaml must be a list of numbers or how many, got 0."),
-        ({"seeds": None}, "seeds of .* must be a list of numbers or how many, got None."),
-        ({"seeds": [1.5]}, r"seeds of .* must be a list of numbers or how many, got \[1.5\]."),
-        ({"seeds": True}, "seeds of .* must be a list of numbers or how many, got True."),
+        ({"seeds": 0}, "seeds of .*mine.yaml must be a list of numbers or how many, at least 1, got 0."),
+        ({"seeds": None}, "seeds of .* must be a list of numbers or how many, at least 1, got None."),
+        ({"seeds": [1.5]}, r"seeds of .* must be a list of numbers or how many, at least 1, got \[1.5\]."),
+        ({"seeds": True}, "seeds of .* must be a list of numbers or how many, at least 1, got True."),
         ({"seeds": [2, 2]}, "seeds of experiment mine must differ, got .2. more than once."),
         ({"variants": None}, "variants of experiment mine must not be empty."),
         ({"variants": {False: {}}}, "variants of .*mine.yaml must have texts for names, got False; put it in quotes."),
@@ -357,7 +357,7 @@ def test_env_steps_of_the_command_replace_those_of_a_variant(write):
 
 
 def test_no_seeds_of_the_command_are_not_those_of_the_file(write):
-    with pytest.raises(ValueError, match="seeds of .* must be a list of numbers or how many, got 0"):
+    with pytest.raises(ValueError, match="seeds of .* must be a list of numbers or how many, at least 1, got 0"):
         read_experiment(write(), seeds=0)
 
 

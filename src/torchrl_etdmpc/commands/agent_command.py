@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from torchrl_etdmpc.envs import Task, get_task
@@ -78,17 +75,3 @@ def with_the_agent_s_planner(values: dict[str, Any], explicit: list[str]) -> dic
     stored = dataclasses.asdict(trained_with(values["checkpoint"]).planner)
     named: Mapping[str, Any] = values["planner"]
     return {**values, "planner": stored | {name: named[name] for name in named if f"planner.{name}" in explicit}}
-
-
-def make_folder(folder: Path, target: Path) -> None:
-    """Makes the folder of what a command will write, or says before its work that this target cannot be written.
-
-    Raises:
-        ValueError: if it cannot.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    except OSError as error:
-        raise ValueError(f"{target} cannot be written ({error.strerror}); choose another path.") from error

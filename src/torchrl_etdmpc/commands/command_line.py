@@ -150,6 +150,8 @@ def _command() -> str:
     return f"python {os.path.relpath(script)}" if script.endswith(".py") else os.path.basename(script)
 
 
+_ELSEWHERE = {"workers": "distributed", "engine": "distributed", "address": "distributed"}
+"""Settings that stand in another command alone."""
 _FLAGS = {"--cfg", "-c", "--resolve", "--multirun", "-m"}
 _PATHS = {"run_dir", "checkpoint", "out", "video", "save"}
 
@@ -187,7 +189,8 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
                 f"{name} is a group of settings; --help {name} lists them, e.g. {_first(name, settings)}=..."
             )
         if name not in settings:
-            raise ValueError(f"unknown setting {name}; {nearest(name, settings)}")
+            hint = f"the command {_ELSEWHERE[name]} has it." if name in _ELSEWHERE else nearest(name, settings)
+            raise ValueError(f"unknown setting {name}; {hint}")
         if argument.startswith("-") or not equals:
             raise ValueError(f"a setting is written name=value, without dashes or spaces, got {argument!r}.")
         if name == "preset":

@@ -11,13 +11,13 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
-from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, make_folder, with_the_agent_s_planner
+from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
-from torchrl_etdmpc.runs.files import write_whole
+from torchrl_etdmpc.runs.files import make_folder_of, write_whole
 from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
 from torchrl_etdmpc.training.config import MOST_EPISODES
@@ -63,7 +63,7 @@ def main(config: EvaluateConfig) -> None:
     for file in (config.video, config.csv):
         if file is not None:
             path = Path(file).expanduser()
-            make_folder(path.parent, path)
+            make_folder_of(path)
     device = resolve_device(config.device)
     task = config.task_spec
     env = make_env(task, seed=config.seed, num_envs=config.episodes, parallel=False)  # side by side

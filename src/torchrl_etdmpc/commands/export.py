@@ -7,11 +7,12 @@ from pathlib import Path
 
 import torch
 
-from torchrl_etdmpc.commands.agent_command import AgentCommandConfig, make_folder
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.planners import export_planner, export_policy
 from torchrl_etdmpc.runs import replacing
+from torchrl_etdmpc.runs.files import make_folder
 from torchrl_etdmpc.training import load_agent
 
 
@@ -33,10 +34,8 @@ class ExportConfig(AgentCommandConfig):
 def main(config: ExportConfig) -> None:
     """Writes an agent's policy and planner as programs that run where only PyTorch is installed."""
     out = Path(config.out).expanduser()
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"out={config.out} is a file; name a folder.")
     agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
-    make_folder(out, out)
+    make_folder(out)
     if config.task not in (None, run.task):
         raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
     model = agent.acting_model

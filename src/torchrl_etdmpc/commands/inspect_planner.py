@@ -20,6 +20,7 @@ from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page import make_page, serve
 from torchrl_etdmpc.inspector.saved_page import free_folder, plotly_script, write_page
 from torchrl_etdmpc.inspector.trace import checksum
+from torchrl_etdmpc.runs.files import make_folder
 from torchrl_etdmpc.training import load_agent, resolve_device
 
 
@@ -66,6 +67,8 @@ def main(config: InspectConfig) -> None:
         free_folder(config.save)
     inspection = _inspection(config)
     try:
+        if config.save is not None:
+            make_folder(free_folder(config.save))
         state = _state(config, inspection)
         if config.save is None:
             app = make_page(inspection, state=state, seed=config.seed, allow_remote=config.allow_remote)

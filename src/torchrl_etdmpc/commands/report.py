@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.runs.files import make_folder
 
 if TYPE_CHECKING:
     from torchrl_etdmpc.analysis import Benchmark, Experiment, Run
@@ -78,6 +79,10 @@ def parse() -> argparse.Namespace:
         get_benchmark(arguments.benchmark)  # a wrong name ends here, also when watching
     if Path(arguments.out).expanduser().is_file():
         raise ValueError(f"--out={arguments.out} is a file; name a folder.")
+    for argument in arguments.runs:
+        name, path = named(argument)
+        if name is not None and hasattr(arguments, name.replace("-", "_")):
+            raise ValueError(f"{argument} would call runs {name!r}; an option is written --{name} {path}.")
     for name in ("budget", "grid_step", "grid_start", "watch"):
         value = getattr(arguments, name)
         if value is not None and value <= 0:
@@ -256,6 +261,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     ]
     comparison = dataclasses.replace(comparison, notes=(*comparison.notes, *notes))
     incomplete = [*lines, *incomplete_runs(found, experiments)]
+    make_folder(Path(arguments.out).expanduser())
     page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector, incomplete=incomplete)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]
     last = chosen["env_steps"].max()

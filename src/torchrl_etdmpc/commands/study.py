@@ -28,7 +28,7 @@ from torchrl_etdmpc.inspector.studies import choose_states
 from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.runs import first_line, library_versions, progress_bar, replacing
-from torchrl_etdmpc.runs.files import write_whole
+from torchrl_etdmpc.runs.files import make_folder, write_whole
 from torchrl_etdmpc.training import load_agent, resolve_device
 
 StudyName = Literal[
@@ -91,8 +91,8 @@ def _main(config: StudyConfig) -> None:
         compile_setting="off",
     )
     env.close(raise_if_closed=False)
-    folder = Path(config.out)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = Path(config.out).expanduser()
+    make_folder(folder)
     episodes: list[Episode] = []
     with progress_bar("playing", config.episodes, "episodes", passing=True) as bar:
         for number in range(config.episodes):
@@ -117,6 +117,8 @@ def _main(config: StudyConfig) -> None:
         f"{task.name}, trained for {counters.get('env_steps', 'an unknown number of')} env steps: "
         f"{config.episodes} episodes, return {returns.mean():.1f}"
     )
+    if config.episodes == 1:
+        print("intervals are over whole episodes, so they are nan; episodes=2 is the least that has some")
     simulator = Simulator(task)
     names = [name for name in get_args(StudyName) if name != "all"] if config.study == "all" else [config.study]
     left_out = []
@@ -131,8 +133,8 @@ def _main(config: StudyConfig) -> None:
             print(f"{name}: left out: {first_line(error)}")
             continue
         lines = module.lines(result)
-        _write(folder, name, module, result, {**about, "study": name, "lines": lines})
         print("\n".join([f"{name}: {folder / name}.png", *(f"  {line}" for line in lines)]))
+        _write(folder, name, module, result, {**about, "study": name, "lines": lines})
 
 
 def _study(

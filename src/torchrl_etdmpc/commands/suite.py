@@ -266,7 +266,10 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
         else:
             raise ValueError(f"unknown setting {name}; {nearest(name, [*own, *training])}")
     if not values.get("experiment") and values.get("runs_dir"):
-        values["experiment"] = str(Path(values["runs_dir"]).expanduser() / "experiment.yaml")
+        file = Path(values["runs_dir"]).expanduser() / "experiment.yaml"
+        if not file.is_file():
+            raise FileNotFoundError(f"runs_dir={file.parent} holds no experiment; begin it with experiment=NAME.")
+        values["experiment"] = str(file)
     if not values.get("experiment"):
         raise ValueError("experiment=... is missing: the name of an experiment; `suite list` lists them.")
     return config_from_dict(SuiteConfig, values), settings

@@ -8,6 +8,7 @@ import io
 import os
 import shutil
 import stat
+import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -48,6 +49,37 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview | str) -> No
     """Writes a file that survives a power cut or is not there."""
     with replacing(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def make_folder(folder: Path) -> None:
+    """Makes a folder, or says before any work is done that nothing can be written there.
+
+    Raises:
+        ValueError: if it cannot.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file; name a folder.")
+    _require_space(folder, folder)
+
+
+def make_folder_of(file: Path) -> None:
+    """The same for a file to be written: makes its folder.
+
+    Raises:
+        ValueError: if it cannot be written.
+    """
+    if file.is_dir():
+        raise ValueError(f"{file} is a folder; name a file.")
+    _require_space(file.parent, file)
+
+
+def _require_space(folder: Path, target: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):  # the one way to know, for every user and file system
+            pass
+    except OSError as error:
+        raise ValueError(f"{target} cannot be written ({error.strerror}); choose another path.") from error
 
 
 def read_whole(path: Path, limit: int | None = None) -> bytes:

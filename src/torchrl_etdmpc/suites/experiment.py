@@ -309,7 +309,9 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
     return Experiment(
         name=file.stem,
         tasks=_tasks(values.get("tasks") if changes.get("tasks") is None else changes["tasks"], file),
-        seeds=_seeds(values.get("seeds") if changes.get("seeds") is None else changes["seeds"], file),
+        seeds=_seeds(values.get("seeds"), file)
+        if changes.get("seeds") is None
+        else _seeds(changes["seeds"], "this call"),
         variants=variants,
         searches=searches,
         settings=shared | more,
@@ -463,7 +465,7 @@ def _seeds(given: Any, what: object) -> tuple[int, ...]:
     seeds = range(1, given + 1) if type(given) is int else given
     _require(
         isinstance(seeds, Iterable) and all(type(seed) is int for seed in seeds) and bool(list(seeds)),
-        f"seeds of {what} must be a list of numbers or how many, got {given!r}.",
+        f"seeds of {what} must be a list of numbers or how many, at least 1, got {given!r}.",
     )
     return tuple(seeds)
 
