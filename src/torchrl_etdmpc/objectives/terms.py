@@ -374,15 +374,18 @@ class LatentRolloutLoss(LossModule):
 
     def _refuse_other_networks(self, state: Mapping[str, Any]) -> None:
         """Raises before anything is overwritten; a tensordict that does not fit says nothing of where."""
-        own = {name: value for name, value in self.state_dict().items() if "_params." in name}
-        networks = {name.partition(".")[0] for name in own} & {name.partition(".")[0] for name in state}
-        given = {name: value for name, value in state.items() if name.partition(".")[0] in networks}
+        networks = {name for name in self._modules if name.endswith("_params")}
+        networks &= {name.partition(".")[0] for name in state}
+        own, given = (
+            {name: value for name, value in entries.items() if name.partition(".")[0] in networks}
+            for entries in (self.state_dict(), state)
+        )
         faults = [
             f"{name} is {list(given[name].shape)} there and {list(value.shape)} here"
             if name in given
             else f"it lacks {name}"
             for name, value in own.items()
-            if name.partition(".")[0] in networks and (name not in given or given[name].shape != value.shape)
+            if name not in given or given[name].shape != value.shape
         ]
         faults += [f"it has {name}" for name in given if name not in own]
         if faults:
