@@ -729,3 +729,12 @@ def test_a_return_that_is_not_a_number_is_not_reached(run_main, capfd):
 def test_a_run_of_one_env_step_makes_no_curve(refused):
     make_run("runs/seed1", text=HEADER + "0,0,0,1.0,10,1,10\n1,1,1,1.0,10,1,10\n", task="gym/Pendulum-v1")
     assert refused("runs") == ("the runs end at 1 env step, which makes no curve; wait for an evaluation after it.")
+
+
+def test_an_option_that_makes_no_sense_is_answered_in_a_line(refused):
+    make_run("runs/a")
+    assert refused("runs", "--budget", "100k") == (
+        "argument --budget: invalid int value: '100k'; --help lists the options."
+    )
+    assert refused("runs", "--grid", "3").startswith("ambiguous option: --grid could match --grid-step, --grid-start; ")
+    assert refused() == "the following arguments are required: [NAME=]PATH; --help lists the options."

@@ -17,7 +17,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.files import make_folder
@@ -31,6 +31,13 @@ DEFAULT_REFERENCES = tuple(REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc
 DEFAULT_GRID_STEP = 100_000
 
 
+class _OneLineParser(argparse.ArgumentParser):
+    """Answers a mistake as the other commands do."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message}; --help lists the options.")
+
+
 def parse() -> argparse.Namespace:
     """The command line.
 
@@ -39,7 +46,7 @@ def parse() -> argparse.Namespace:
     """
     from torchrl_etdmpc.analysis import BENCHMARKS, get_benchmark
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _OneLineParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="[NAME=]PATH", help="run directories, or folders of them")
     parser.add_argument("--benchmark", help=f"one of {', '.join(BENCHMARKS)}; default: that of the runs' tasks")
     parser.add_argument(
