@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
 from torchrl_etdmpc.objectives.policy import policy_term, register_running_scale
-from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.terms import KLDirection, Term
 from torchrl_etdmpc.objectives.value import value_term
 from torchrl_etdmpc.objectives.world_model import model_terms
 

@@ -13,7 +13,8 @@ from torchrl_etdmpc.functional import gaussian_entropy, tanh_log_slope, two_hot_
 from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives.action_value import draw_two_heads
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Term, require_not_negative
+from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss
+from torchrl_etdmpc.objectives.terms import Term, require_not_negative
 
 
 class PolicyValue(NamedTuple):

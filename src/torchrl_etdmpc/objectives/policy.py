@@ -17,7 +17,8 @@ from torchrl_etdmpc.objectives.latent_rollout import (
     head_rows,
     mean_of_head_rows,
 )
-from torchrl_etdmpc.objectives.terms import KLDirection, LatentRolloutLoss, Reduction, Term, require_not_negative
+from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
+from torchrl_etdmpc.objectives.terms import KLDirection, Term, require_not_negative
 
 _DIRECTIONS = get_args(KLDirection)
 

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives.action_value import action_value_term
+from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
 from torchrl_etdmpc.objectives.max_q import max_q_term, register_q_scale
-from torchrl_etdmpc.objectives.terms import LatentRolloutLoss, Reduction, Term
+from torchrl_etdmpc.objectives.terms import Term
 from torchrl_etdmpc.objectives.world_model import model_terms
 
 

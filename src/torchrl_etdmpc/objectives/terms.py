@@ -1,27 +1,17 @@
-"""Losses made of terms: what a term names, and the loss that evaluates a list of them on one latent rollout."""
+"""The terms of a loss: what one names, and whether those of a loss fit together."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, get_args
+from typing import Literal
 
-import torch
-import torch.distributed as dist
-from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
-from tensordict.nn import dispatch
+from tensordict import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 
-from torchrl_etdmpc.keys import ACTION, DONE, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.modules.new_weights import draw_new_weights
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, counted_mean, latent_rollout
-from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices
 
-Reduction = Literal["none", "mean", "sum"]
-"""What a loss makes of the errors of its steps."""
 KLDirection = Literal["backward", "forward"]
 """``"backward"`` is ``KL(pi || plan)``, ``"forward"`` is ``KL(plan || pi)``."""
 TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tensor, dict[str, Tensor]]]
@@ -29,10 +19,6 @@ TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tens
 
 PRIORITY = "priority"
 """Under which name among its metrics a term offers errors ``[T, B]`` to make priorities of, where there are weights."""
-_FEATURES = ("action", "reward", "terminated", "plan_loc", "plan_scale")
-_OBSERVATIONS = ("observation", "next_observation")
-_REDUCTIONS = get_args(Reduction)
-_FIELDS = (*_OBSERVATIONS, *_FEATURES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,644 +103,6 @@ class Term:
         return error, metrics
 
 
-def _check_reduction(reduction: str) -> None:
-    if reduction not in _REDUCTIONS:
-        raise ValueError(f"reduction must be one of {', '.join(_REDUCTIONS)}, got {reduction!r}.")
-
-
-def _reduced(term: Tensor, slices: Slices, reduction: Reduction) -> Tensor:
-    """A term ``[T, B]`` to a scalar, or to ``[B, T]`` without reduction; steps that do not count are zeros."""
-    _check_reduction(reduction)
-    if slices.weights is None and reduction == "mean":
-        return counted_mean(term, slices.counts)
-    weights = slices.weights
-    if slices.counts is not None:
-        term = torch.where(slices.counts, term, 0)
-        weights = None if weights is None else torch.where(slices.counts, weights, 0)
-    if weights is not None:
-        term = term * weights
-        if reduction == "mean":  # as TorchRL's losses: the weighted average
-            return term.sum() / weights.sum().clamp_min(torch.finfo(weights.dtype).tiny)
-    return term.sum() if reduction == "sum" else term.transpose(0, 1)
-
-
-class LatentRolloutLoss(LossModule):
-    """A loss made of terms, which trains a :class:`~torchrl_etdmpc.modules.WorldModel` on replayed slices.
-
-    What it trains, reads and returns follows from its terms. Every term is weighted once, by the coefficient buffer
-    ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are. A coefficient is assigned like a number
-    (``loss.reward_coef = 0.3``), in place.
-
-    Networks stay shared with the world model that was passed: the planner that holds it sees every update. Every step
-    of a PyTorch optimiser that trains them counts as one in ``world_model.version``, which dates the planner's targets
-    and is part of this loss' state. So are the coefficients and the discount, as with TorchRL's losses: whoever loads a
-    state takes them over, while options that are plain numbers (``value_beta``, ``scale_tau``) stay as constructed.
-
-    Padded steps count for nothing: not in losses, gradients, running scale or metrics. The mask is found as TorchRL's
-    losses find it: at ``("collector", "mask")``, which collectors write with ``split_trajs=True``, and at
-    ``"shifted_valid"``, where the batch has them; or at the key ``loss.loss_mask_key``. A step counts if no step of its
-    slice up to it is masked, since the rollout goes through all of them; means divide by the number of those.
-
-    Where a prioritised sampler has written ``priority_weight``, the mean is weighted by it, slice by slice, and the new
-    priorities of the slices, the mean absolute errors of their values against the targets, are written into the batch
-    at ``td_error``, for ``buffer.update_tensordict_priority(batch[:, 0])``, which leaves the rows alone that no drawn
-    slice begins with: the only entry that a loss writes to its input.
-    ``loss.use_prioritized_weights = False`` leaves the weights aside, not the priorities. A loss without values has no
-    priority to offer.
-
-    The term named ``"policy"`` can be turned off: ``loss.distill = False``, while pretraining on random data, say.
-
-    Args:
-        world_model (WorldModel): the networks, shared with the caller.
-        terms (sequence of Term): in the order in which they are evaluated.
-
-    Keyword Args:
-        extra_terms (sequence of Term): terms of the user's own, after the others.
-        rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
-        ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
-            head. Default: ``True``.
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
-
-    Raises:
-        TypeError: if a term is not a :class:`Term`.
-        ValueError: if an argument is out of range, a term names a network that there is not, or two names of terms,
-            coefficients or metrics are the same.
-
-    >>> from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss
-    >>> from torchrl_etdmpc.testing import random_slices
-    >>> loss = EfficientTDMPCModelLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
-    >>> loss(random_slices(3, 2))["loss_reward"].shape
-    torch.Size([])
-    """
-
-    # TorchRL sums every entry that starts with "loss_" (its Trainer does, and so do users), so the entries must carry
-    # their weight; the unweighted values are the metrics that end in "_error" or "_kl".
-
-    @dataclass
-    class _AcceptedKeys:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Configurable tensordict keys.
-
-        Attributes:
-            observation (NestedKey): observation, ``[B, T, O]`` or what the encoder takes: any shape and dtype, or a
-                dictionary of entries, with [B, T] in front; its successor is read at ``("next", observation)``.
-            action (NestedKey): replayed action ``[B, T, A]`` in [-1, 1].
-            reward (NestedKey): read at ``("next", reward)``, ``[B, T, 1]``.
-            terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head;
-                without one it is looked at only to refuse termination.
-            plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
-            plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``; zeros for a step that has
-                no plan, and then trains everything but the policy.
-            priority_weight (NestedKey): importance weight of each slice, ``[B, T]``, which a prioritised sampler
-                writes; optional.
-            priority (NestedKey): where the new priorities are written, ``[B, T]``, if the batch has weights.
-        """
-
-        observation: NestedKey = OBSERVATION
-        action: NestedKey = ACTION
-        reward: NestedKey = REWARD
-        terminated: NestedKey = TERMINATED
-        plan_loc: NestedKey = (PLAN, LOC)
-        plan_scale: NestedKey = (PLAN, SCALE)
-        priority_weight: NestedKey = "priority_weight"
-        priority: NestedKey = "td_error"
-
-    tensor_keys: _AcceptedKeys  # pyright: ignore[reportIncompatibleMethodOverride]
-    default_keys = _AcceptedKeys
-    default_value_estimator = None  # pyright: ignore[reportAssignmentType]
-
-    world_model: WorldModel
-    reduction: Reduction  # pyright: ignore[reportIncompatibleVariableOverride]
-    rho: Tensor
-    # Each loss has what its networks and terms need of the following.
-    encoder: nn.Module
-    encoder_params: TensorDictParams
-    target_encoder_params: TensorDictParams
-    dynamics: nn.Module
-    dynamics_params: TensorDictParams
-    target_dynamics_params: TensorDictParams
-    reward: nn.Module
-    reward_params: TensorDictParams
-    target_reward_params: TensorDictParams
-    value: nn.Module
-    value_params: TensorDictParams
-    target_value_params: TensorDictParams
-    termination: nn.Module
-    termination_params: TensorDictParams
-    target_termination_params: TensorDictParams
-    policy: nn.Module
-    policy_params: TensorDictParams
-    target_policy_params: TensorDictParams
-    discount: Tensor
-    entropy_coef: Tensor
-    kl_scale: Tensor
-    q_scale: Tensor
-    scale_tau: float
-    kl_direction: KLDirection
-    _trained: dict[str, tuple[Tensor | None, set[int]]]
-    """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
-
-    _attributes: ClassVar[dict[str, str]] = {
-        "encoder": "encoder",
-        "dynamics": "dynamics",
-        "reward": "reward_head",
-        "value": "value_head",
-        "termination": "termination_head",
-        "policy": "policy",
-    }
-
-    def __init__(
-        self,
-        world_model: WorldModel,
-        terms: Sequence[Term],
-        *,
-        extra_terms: Sequence[Term] = (),
-        rho: float = 0.5,
-        ignore_termination: bool = True,
-        reduction: Reduction | None = None,
-    ) -> None:
-        super().__init__()
-        self._in_keys = None
-        self._out_keys = None
-        self.reduction = "mean" if reduction is None else reduction
-        _check_reduction(self.reduction)
-        if not 0 < rho <= 1:
-            raise ValueError(f"rho must be in (0, 1], got {rho}.")
-        vars(self)["world_model"] = world_model
-        self.ignore_termination = ignore_termination
-        self.terms = (*terms, *extra_terms)
-        _check_terms(self, terms, extra_terms)
-        self._trained = {}
-        trained = {name for term in self.terms for name in term.networks}
-        followed = {name for term in self.terms for name in term.targets}
-        for name, attribute in self._attributes.items():
-            if name in trained and getattr(world_model, attribute) is not None:
-                self.convert_to_functional(getattr(world_model, attribute), name, create_target_params=name in followed)
-        device = world_model.version.device
-        self._scalars: frozenset[str] = frozenset()
-        for term in self.terms:
-            numbers = {f"{term.name}_coef": term.coef, **term.scalars}
-            for name, number in numbers.items():
-                if not math.isfinite(number):
-                    raise ValueError(f"{name} must be finite, got {number}.")
-                self.register_coeff_buffer(name, float(number), device=device)
-            self._scalars |= numbers.keys()
-            if isinstance(term.function, nn.Module):
-                self.add_module(term.name, term.function)
-        self.register_buffer("rho", torch.tensor(float(rho), device=device))
-        self.distill = True
-        count_updates(world_model, self.parameters())
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # TorchRL has a list of such buffers for a class; here each loss has those of its terms.
-        scalars = (*vars(self).get("_scalars", ()), "rho")
-        if isinstance(value, int | float) and name in scalars and name in self._buffers:
-            self.get_buffer(name).fill_(value)
-        else:
-            super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]  # TorchRL's annotation is too narrow
-
-    def _apply(self, fn, *args, **kwargs):
-        # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
-        scalars = {name: self.get_buffer(name) for name in (*self._scalars, "rho")}
-        super()._apply(fn, *args, **kwargs)
-        for name, exact in scalars.items():
-            now = self.get_buffer(name)
-            if now.element_size() < 4:  # a discount of 0.99 is 0.988 in bfloat16
-                self.register_buffer(name, exact.to(now.device))
-        self.__dict__["world_model"]._apply(fn)
-        self._read_networks()  # a cast keeps parameters and replaces buffers
-        return self
-
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """There is none to choose: the value targets are the terms' own.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(
-            f"{type(self).__name__} makes its value targets itself, imagined ones and with value_replayed=... n-step "
-            "returns of what was replayed; there is no estimator to choose."
-        )
-
-    def _make_vmap(self) -> None:
-        """TorchRL's hook for losses that use vmap with random numbers: the ensembles here are stacked, without it."""
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        self._in_keys = None  # a new name for a key changes what dispatch expects
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._trained = {}
-        # A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__, where
-        # convert_to_functional put them), but tensordict clones its entries: the loss would train weights that nobody
-        # reads. The targets are nobody else's and stay as copied.
-        self._read_networks()
-        count_updates(self.world_model, self.parameters())
-
-    def _read_networks(self) -> None:
-        """Makes the entries of <name>_params the very parameters and buffers of the world model's networks again.
-
-        Planner, loss and updater rely on it.
-        """
-        for name in self._attributes:
-            if f"{name}_params" in self._modules:
-                self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        # The world model is not a submodule, but who restores the weights restores the number of updates in them.
-        destination[f"{prefix}version"] = self.world_model.version.detach()
-
-    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._refuse_other_networks({k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)})
-        version = state_dict.get(f"{prefix}version")
-        super()._load_from_state_dict({k: v for k, v in state_dict.items() if k != f"{prefix}version"}, prefix, *args)
-        if version is not None:  # files of before do not have it
-            self.world_model.version.copy_(version)
-            restart_count(self.world_model)
-
-    def _refuse_other_networks(self, state: Mapping[str, Any]) -> None:
-        """Raises before anything is overwritten; a tensordict that does not fit says nothing of where."""
-        networks = {name for name in self._modules if name.endswith("_params")}
-        networks &= {name.partition(".")[0] for name in state}
-        own, given = (
-            {name: value for name, value in entries.items() if name.partition(".")[0] in networks}
-            for entries in (self.state_dict(), state)
-        )
-        faults = [
-            f"{name} is {list(given[name].shape)} there and {list(value.shape)} here"
-            if name in given
-            else f"it lacks {name}"
-            for name, value in own.items()
-            if name not in given or given[name].shape != value.shape
-        ]
-        faults += [f"it has {name}" for name in given if name not in own]
-        if faults:
-            more = f", and {len(faults) - 1} more" if faults[1:] else ""
-            raise RuntimeError(f"the state is of another world model: {faults[0]}{more}; build this one like that one.")
-
-    def reset_parameters_recursive(self) -> None:
-        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones.
-
-        Running scales begin anew.
-        """
-        for name in self._attributes:
-            if f"{name}_params" in self._modules:
-                draw_new_weights(self.__dict__[name])
-        for term in self.terms:
-            if isinstance(term.function, nn.Module):
-                draw_new_weights(term.function)
-        parameters: dict[str, Any] = self._modules
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                target.data.update_(parameters[name.removeprefix("target_")].data)
-        for name in ("kl_scale", "q_scale"):
-            if name in self._buffers:
-                self.get_buffer(name).fill_(1)
-
-    def network_parameters(self) -> dict[str, list[nn.Parameter]]:
-        """Every parameter of this loss, once, by its network: of the world model, or of a term that brings its own."""
-        found: dict[str, list[nn.Parameter]] = {}
-        for name, parameter in self.named_parameters():  # lists a parameter that is shared once
-            found.setdefault(name.partition(".")[0].removesuffix("_params"), []).append(parameter)
-        return found
-
-    @property
-    def distill(self) -> bool:
-        """Whether the policy term is computed."""
-        return self._distill
-
-    @distill.setter
-    def distill(self, value: bool) -> None:
-        self._distill = bool(value)
-        self._in_keys = None
-
-    @property
-    def active_terms(self) -> tuple[Term, ...]:
-        """The terms that :meth:`forward` evaluates; that of the policy only while :attr:`distill` is on."""
-        return self.terms if self._distill else tuple(term for term in self.terms if term.name != "policy")
-
-    def _reads(self) -> dict[NestedKey, NestedKey]:
-        """Where each field of the slices is read, and each further key of the terms."""
-        names = dict.fromkeys([*_OBSERVATIONS, "action", *(key for term in self.active_terms for key in term.keys)])
-        return {name: self._key(name) for name in names}
-
-    def _key(self, name: NestedKey) -> NestedKey:
-        if name not in _FIELDS:
-            return unravel_key(name)
-        key = getattr(self.tensor_keys, name.removeprefix("next_"))
-        return unravel_key((NEXT, key)) if name in ("next_observation", "reward", "terminated") else unravel_key(key)
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that ``forward`` reads."""
-        if self._in_keys is None:
-            self._in_keys = list(self._reads().values())
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._in_keys = keys
-
-    @property
-    def out_keys(self) -> list[str]:
-        """Keys that ``forward`` returns: the ``loss_*`` terms, then the metrics."""
-        if self._out_keys is None:
-            terms = self.active_terms
-            return [f"loss_{term.name}" for term in terms] + [name for term in terms for name in term.metric_names]
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, keys: list[str]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._out_keys = keys
-
-    def slices(self, tensordict: TensorDictBase) -> Slices:
-        """The entries that this loss reads, time first.
-
-        Args:
-            tensordict (TensorDictBase): batch size [B, T].
-
-        Raises:
-            ValueError: if the batch is empty, an entry is not of shape [B, T, features] (one that the encoder owns:
-                [B, T, ...]), or
-                a row of a CPU tensor terminates although the world model has no termination head. Elsewhere that
-                check would wait for the device, and under ``torch.compile`` it cannot be made: it is skipped.
-            KeyError: if a key is missing.
-            RuntimeError: if the world model's weights are no longer those that this loss trains, or its targets are
-                elsewhere.
-        """
-        self._refuse_other_weights()
-        reads = self._reads()
-        entries: dict[NestedKey, Any] = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
-        for name, entry in entries.items():
-            if entry.shape[:2] != entries["action"].shape[:2]:  # it would be spread over the batch, or fail elsewhere
-                raise self._shape_error(reads[name], entry)
-        if 0 in entries["action"].shape[:2]:
-            raise ValueError(
-                f"{type(self).__name__} needs at least one step, got {list(tensordict.batch_size)} slices."
-            )
-        counts = self._counted_steps(tensordict, entries["action"].shape[:2])
-        self._refuse_termination(tensordict, counts)
-        self._refuse_gaps(tensordict, counts, entries["action"].shape[:2])
-        for name, entry in entries.items():
-            if counts is not None:
-                # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
-                entry = _where(counts, entry, torch.ones_like if name == "plan_scale" else torch.zeros_like)
-            entries[name] = entry.transpose(0, 1)
-        fields: dict[str, Any] = {name: entries.pop(name, None) for name in _FIELDS}
-        fields["observation"] = fields["observation"][0]
-        for name in ("reward", "terminated"):
-            if fields[name] is not None:
-                fields[name] = fields[name].squeeze(-1)
-        if fields["terminated"] is not None:
-            fields["terminated"] = fields["terminated"].bool()
-        counts = None if counts is None else counts.transpose(0, 1)
-        weights = tensordict.get(self.tensor_keys.priority_weight, None)
-        prioritised = weights is not None
-        if not self.use_prioritized_weights:
-            weights = None
-        if weights is not None:
-            # One weight per slice: that of its first row, which the sampler drew.
-            steps, slices = fields["action"].shape[:2]
-            weights = weights.reshape(slices, steps)[:, 0].expand(steps, slices).to(fields["action"].dtype)
-        return Slices(**fields, counts=counts, weights=weights, prioritised=prioritised, extra=entries or None)
-
-    def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor | TensorDictBase:
-        value = tensordict.get(key, None)
-        if value is None:
-            rename = f"loss.set_keys({name.removeprefix('next_')}=...)" if name in _FIELDS else "Term(keys=...)"
-            raise KeyError(
-                f"{type(self).__name__} needs the key {key!r} in its input; rename it with {rename} or store it in the "
-                "replay buffer."
-            )
-        # The batch size is no guide: dispatch infers a longer one where all entries agree in size.
-        vector = name in _FEATURES or (name in _OBSERVATIONS and self.world_model.observation_dim is not None)
-        if value.ndim != 3 if vector else value.ndim < 2:
-            raise self._shape_error(key, value)
-        if vector:
-            self._check_features(name, key, value)
-        return value
-
-    def _check_features(self, name: NestedKey, key: NestedKey, value: Any) -> None:
-        """A last dimension of 1 would be spread over an action, and another size fail where no key is known."""
-        model = self.world_model
-        size = model.observation_dim if name in _OBSERVATIONS else 1 if name in ("reward", "terminated") else None
-        size = model.action_dim if size is None else size
-        if value.shape[-1] != size:
-            raise ValueError(
-                f"{type(self).__name__} needs {size} features in the last dimension of {key!r}, got {value.shape[-1]} "
-                f"(shape {list(value.shape)}); store the entry so, or build the world model for it."
-            )
-        if name == "action" and not value.is_floating_point():
-            raise ValueError(
-                f"{type(self).__name__} needs continuous actions in [-1, 1], got {key!r} of {value.dtype}; discrete "
-                "actions have no Gaussian policy."
-            )
-        if name in ("action", *_OBSERVATIONS) and value.dtype == torch.float64 != model.bins.dtype:
-            raise ValueError(
-                f"{type(self).__name__} needs {key!r} in {model.bins.dtype}, as the weights are, got {value.dtype}; "
-                "append DoubleToFloat() to the environment, or convert the batch."
-            )
-
-    def _refuse_other_weights(self) -> None:
-        if torch.compiler.is_compiling():
-            return
-        for name, attribute in self._attributes.items():
-            held: Any = self._modules.get(f"{name}_params")
-            if held is None:
-                continue
-            # An encoder may begin with buffers, and have nothing else.
-            own = (value for value in held.values(True, True) if isinstance(value, nn.Parameter))
-            network, first = getattr(self.world_model, attribute), next(own, None)
-            now = next(network.parameters(), None)
-            if name not in self._trained or self._trained[name][0] is not first:
-                parameters = () if first is None else (first, *own)
-                self._trained[name] = first, {id(parameter) for parameter in parameters}
-            if now is not first or {id(parameter) for parameter in network.parameters()} != self._trained[name][1]:
-                raise RuntimeError(
-                    f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
-                    "assign=True), a new module or layer and to_module() of the loss put other parameters there; load "
-                    "without assign, build the loss and its optimizer afterwards, or swap those of the world model."
-                )
-            target: Any = self._modules.get(f"target_{name}_params")
-            if target is None or now is None:
-                continue
-            if (_first(target).dtype, _first(target).device) != (now.dtype, now.device):
-                raise RuntimeError(
-                    f"world_model.{attribute} is {now.dtype} on {now.device}, its targets are {_first(target).dtype} "
-                    f"on {_first(target).device}; move or cast the loss, which takes the world model along: "
-                    "loss.to(...)."
-                )
-
-    def _shape_error(self, key: NestedKey, value: Tensor | TensorDictBase) -> ValueError:
-        return ValueError(
-            f"{type(self).__name__} needs a batch of slices [B, T] and entries of shape [B, T, features], got "
-            f"{key!r} of shape {list(value.shape)}; reshape a flat replay sample with sample.reshape(-1, slice_len)."
-        )
-
-    def write_priority(self, tensordict: TensorDictBase, evaluated: dict[str, Tensor]) -> None:
-        """Moves the priorities of a batch, if there are some, from what :meth:`evaluate` returned into the batch."""
-        priority = evaluated.pop(PRIORITY, None)
-        if priority is not None:
-            tensordict.set(self.tensor_keys.priority, priority)
-
-    def _counted_steps(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
-        """The steps up to which nothing in their slice is masked, bool ``[B, T]``; ``None`` without a mask."""
-        counts = None
-        for key in self._loss_mask_keys():
-            mask = tensordict.get(key, None)
-            if mask is None:
-                continue
-            if mask.numel() != shape.numel() or mask.shape[:2] != shape:
-                raise ValueError(
-                    f"the mask {key!r} must have the shape [B, T]={list(shape)}, got {list(mask.shape)}; set "
-                    "loss.loss_mask_key to the key of another mask, or to None for no mask."
-                )
-            mask = mask.reshape(shape).bool()
-            counts = mask if counts is None else counts & mask
-        return None if counts is None else counts.int().cumprod(1) > 0
-
-    def _refuse_termination(self, tensordict: TensorDictBase, counts: Tensor | None) -> None:
-        if self.ignore_termination or self.world_model.termination_head is not None or torch.compiler.is_compiling():
-            return
-        terminated = tensordict.get(self._key("terminated"), None)
-        if terminated is None or terminated.device.type != "cpu":
-            return
-        if counts is not None:
-            terminated = terminated.squeeze(-1).bool() & counts
-        if terminated.any():
-            raise ValueError(
-                f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
-                "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
-                f"{type(self).__name__}(..., ignore_termination=True) if that is what you want."
-            )
-
-    def _refuse_gaps(self, tensordict: TensorDictBase, counts: Tensor | None, shape: torch.Size) -> None:
-        """Steps must follow each other, one at a time: what n-step returns and episodes side by side do not."""
-        if torch.compiler.is_compiling():
-            return
-        done, steps = tensordict.get((NEXT, DONE), None), tensordict.get("steps_to_next_obs", None)
-        if steps is not None and steps.device.type == "cpu" and (steps != 1).any():
-            raise ValueError(
-                "'steps_to_next_obs' is not 1 everywhere: these losses learn single steps, and n-step rewards and "
-                "observations would be taken for those of one; leave MultiStep out, value_replayed=... has n-step "
-                "targets."
-            )
-        if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
-            return
-        inside = done.reshape(shape)[:, :-1].bool()
-        if (inside if counts is None else inside & counts[:, 1:]).any():
-            raise ValueError(
-                f"{(NEXT, DONE)!r} is True before the last step of a slice, so that another episode follows in it; "
-                "sample slices of one episode each (StepSliceSampler), or mask what follows (loss_mask_key)."
-            )
-
-    @dispatch  # pyright: ignore[reportArgumentType]
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes the terms on a batch of slices.
-
-        Args:
-            tensordict (TensorDictBase): slices of T consecutive transitions of one episode each, batch size [B, T].
-
-        Returns:
-            TensorDictBase: ``loss_*`` entries (scalars, or ``[B, T]`` with ``reduction="none"``), weighted by their
-            coefficients and by ``rho^k`` at step k, and detached scalar metrics. Means are over the steps that count.
-
-        Raises:
-            ValueError: as ``slices``.
-            KeyError: if a key is missing.
-        """
-        terms = self.evaluate(self.slices(tensordict), self.targets(), self.reduction)
-        self.write_priority(tensordict, terms)
-        unread = self._parameters_without_a_term()
-        if unread and dist.is_available() and dist.is_initialized():
-            # DistributedDataParallel waits for a gradient of every parameter and cannot look for those without one in a
-            # TensorDict. Nobody sees this zero, and the gradient of these parameters is one.
-            name = next(iter(terms))
-            terms[name] = terms[name] + 0 * torch.stack([parameter.sum() for parameter in unread]).sum()
-        out = TensorDict(terms, batch_size=[])
-        self._clear_weakrefs(tensordict, out)
-        return out
-
-    def _parameters_without_a_term(self) -> list[nn.Parameter]:
-        """Of the networks that only terms train which are not active."""
-        active = {name for term in self.active_terms for name in (term.name, *term.networks)}
-        idle = {name for term in self.terms for name in (term.name, *term.networks)} - active
-        return [p for name, own in self.network_parameters().items() if name in idle for p in own] if idle else []
-
-    def targets(self) -> dict[str, dict[str, Tensor]]:
-        """What the target networks are made of, by network and name: their parameters, and the network's own buffers.
-
-        ``SoftUpdate`` moves parameters alone, and a target whose statistics stay where they began is another network.
-        """
-        found: dict[str, dict[str, Tensor]] = {}
-        parameters: dict[str, Any] = self._modules
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                network = name.removeprefix("target_").removesuffix("_params")
-                entries = found[network] = {}
-                for key in target.keys(True, True):
-                    own = parameters[f"{network}_params"].get(key)
-                    trained = isinstance(own, nn.Parameter)
-                    entry = target.get(key).data if trained else own.detach().clone()  # it moves before it is read
-                    entries[key if isinstance(key, str) else ".".join(key)] = entry
-        return found
-
-    def evaluate(
-        self, slices: Slices, targets: Mapping[str, Mapping[str, Tensor]], reduction: Reduction = "mean"
-    ) -> dict[str, Tensor]:
-        """What :meth:`forward` returns, from plain tensors: the part that compiles as one graph.
-
-        Args:
-            slices (Slices): from ``slices``.
-            targets (mapping): from :meth:`targets`.
-            reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
-
-        Returns:
-            dict: ``loss_*`` terms weighted by their coefficients, and detached metrics; with weights also the
-            priorities ``[B, T]``, which :meth:`write_priority` takes out.
-        """
-        if self.training and "encoder_params" in self._modules:  # who trains an encoder moves its statistics, too
-            observe = getattr(self.world_model.encoder, "observe", None)
-            if observe is not None:
-                counts = None if slices.counts is None else slices.counts[0]
-                observe(slices.observation, counts)  # the first of each slice
-        rollout = latent_rollout(self.world_model, slices)._replace(targets=targets)
-        losses, metrics = {}, {}
-        for term in self.active_terms:
-            error, reported = term.evaluate(self.world_model, slices, rollout)
-            weighted = self._discount_depth(error) if term.decayed else error
-            coef = self.get_buffer(f"{term.name}_coef")
-            losses[f"loss_{term.name}"] = coef * _reduced(weighted, slices, reduction)
-            if PRIORITY in reported:
-                metrics[PRIORITY] = self._priority(reported[PRIORITY], slices)
-            for name in term.metric_names:
-                metric = reported[name]
-                metrics[name] = (counted_mean(metric, slices.counts) if metric.ndim else metric).detach()
-        return losses | metrics
-
-    def _priority(self, error: Tensor, slices: Slices) -> Tensor:
-        """The mean of the errors ``[T, B]`` of each slice, for all of its rows, ``[B, T]``."""
-        counts = torch.ones_like(error) if slices.counts is None else slices.counts.to(error.dtype)
-        mean = (error * counts).sum(0) / counts.sum(0).clamp_min(1)
-        return mean.detach().unsqueeze(-1).repeat(1, len(error))
-
-    def _discount_depth(self, error: Tensor) -> Tensor:
-        """Weights ``[T, B]`` errors by ``rho^k``."""
-        powers = self.rho ** torch.arange(error.shape[0], device=error.device, dtype=error.dtype)
-        return error * powers.unsqueeze(-1)
-
-
-def _first(params: Any) -> Tensor:
-    return next(iter(params.values(True, True)))
-
-
-def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:
-    """The entry ``[B, T, ...]``, or each of a dictionary, where the step counts, and harmless values elsewhere."""
-    if isinstance(entry, TensorDictBase):
-        return entry.apply(lambda value: _where(counts, value, harmless))
-    return torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))
-
-
 def require_not_negative(**coefs: float) -> None:
     """Raises a ``ValueError`` where a coefficient of the method's own terms is below 0: it would train away from it."""
     for name, coef in coefs.items():
@@ -762,39 +110,49 @@ def require_not_negative(**coefs: float) -> None:
             raise ValueError(f"{name} must not be negative, got {coef}; 0 leaves the term out of the sum.")
 
 
-def _check_terms(loss: LatentRolloutLoss, terms: Sequence[Term], extra_terms: Sequence[Term]) -> None:
-    """Raises where a term is of another kind than stated, a name is there twice, or a network is not known."""
-    networks = loss._attributes
-    for argument, own in (("terms", terms), ("extra_terms", extra_terms)):
-        for term in own:
-            if not isinstance(term, Term):
-                raise TypeError(f"{argument} must be a list of Term(name, function, coef), got {term!r} in it.")
-            _check_networks(term, networks)
-    taken, trained = {"rho"}, {name for term in (*terms, *extra_terms) for name in term.networks}
-    for argument, own in (("terms", terms), ("extra_terms", extra_terms)):
-        for term in own:
-            named_after = argument == "terms" and term.name in networks and not isinstance(term.function, nn.Module)
-            if not term.name.isidentifier() or any(
-                _is_taken(loss, name, taken, () if named_after else networks)
-                for name in (term.name, f"{term.name}_coef")
-            ):
-                raise ValueError(f"{argument} must have names of their own, got {term.name!r}; choose another one.")
-            taken |= {term.name, f"{term.name}_coef"}
-            for name in (*term.scalars, *term.metric_names):
-                if _is_taken(loss, name, taken, networks) or name.startswith("loss_"):
-                    raise ValueError(
-                        f"metrics and scalars must have names of their own, got {name!r} of the term {term.name!r}; "
-                        "choose another one."
-                    )
-                taken.add(name)
-            idle = [name for name in term.targets if name not in trained]
-            if idle:
+def check_terms(
+    terms: Sequence[Term], extra_terms: Sequence[Term], *, networks: Collection[str], reserved: Collection[str]
+) -> None:
+    """Whether a loss can be made of these terms.
+
+    Args:
+        terms (sequence of Term): the loss's own; one may have the name of the network that it trains.
+        extra_terms (sequence of Term): the user's.
+
+    Keyword Args:
+        networks (collection of str): names of the networks that there may be.
+        reserved (collection of str): what the loss has of other names.
+
+    Raises:
+        TypeError: if something in the lists is not a :class:`Term`.
+        ValueError: if a name is there twice or means something else, or a term asks for what no loss has.
+    """
+    named = [("terms", term) for term in terms] + [("extra_terms", term) for term in extra_terms]
+    for argument, term in named:
+        if not isinstance(term, Term):
+            raise TypeError(f"{argument} must be a list of Term(name, function, coef), got {term!r} in it.")
+        _check_networks(term, networks)
+    trained = {name for _, term in named for name in term.networks}
+    taken = set(reserved)
+    for argument, term in named:
+        named_after_network = argument == "terms" and not isinstance(term.function, nn.Module)
+        others = taken if named_after_network else taken.union(networks)
+        if not term.name.isidentifier() or _is_taken(term.name, others) or _is_taken(f"{term.name}_coef", others):
+            raise ValueError(f"{argument} must have names of their own, got {term.name!r}; choose another one.")
+        taken |= {term.name, f"{term.name}_coef"}
+        for name in (*term.scalars, *term.metric_names):
+            if _is_taken(name, taken.union(networks)) or name.startswith("loss_"):
                 raise ValueError(
-                    f"the target {idle[0]!r} of the term {term.name!r} is of a network that no term trains."
+                    f"metrics and scalars must have names of their own, got {name!r} of the term {term.name!r}; "
+                    "choose another one."
                 )
+            taken.add(name)
+        idle = [name for name in term.targets if name not in trained]
+        if idle:
+            raise ValueError(f"the target {idle[0]!r} of the term {term.name!r} is of a network that no term trains.")
 
 
-def _check_networks(term: Term, networks: Mapping[str, str]) -> None:
+def _check_networks(term: Term, networks: Collection[str]) -> None:
     for argument in ("networks", "targets", "keys", "metrics"):
         names = getattr(term, argument)
         if isinstance(names, str):
@@ -808,7 +166,5 @@ def _check_networks(term: Term, networks: Mapping[str, str]) -> None:
             )
 
 
-def _is_taken(loss: LatentRolloutLoss, name: str, taken: Iterable[str], networks: Iterable[str]) -> bool:
-    """Whether the loss has, or may get, something else of that name."""
-    special = name.startswith("target_") or name.endswith("_params")
-    return special or name in taken or name in networks or name in vars(loss) or hasattr(type(loss), name)
+def _is_taken(name: str, taken: Collection[str]) -> bool:
+    return name in taken or name.startswith("target_") or name.endswith("_params")

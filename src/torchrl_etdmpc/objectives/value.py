@@ -19,7 +19,8 @@ from torchrl_etdmpc.functional import (
 )
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
-from torchrl_etdmpc.objectives.terms import PRIORITY, LatentRolloutLoss, Reduction, Term, require_not_negative
+from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
+from torchrl_etdmpc.objectives.terms import PRIORITY, Term, require_not_negative
 
 
 @torch.no_grad()
