@@ -2,10 +2,12 @@
 
     python benchmarks/moments.py runs/mine                    # goes on for 8 x 300 env steps
     python benchmarks/moments.py runs/mine --every 100 --times 20 --out moments.csv
+    python benchmarks/moments.py runs/mine --compare acting   # an elite acts, the mean, or as in training
 
 Goes on from the last checkpoint of a run, in a copy of it, and every so many env steps plays the evaluation's episodes,
-the same ones each time: by the weights of that moment, by their running averages (decay per decision) and by the policy
-of that moment without the planner. Prints a table, with the mean return of the training episodes that ended in between.
+the same ones each time: by the weights of that moment, by their running averages (decay per decision) or in the other
+ways of acting, and by the policy of that moment without the planner. Prints a table, with the mean return of the
+training episodes that ended in between.
 """
 
 from __future__ import annotations
@@ -24,15 +26,22 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import ExplorationType
+from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.checkpoints import CheckpointError
 from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.runs import RunDirectory, RunLog
 from torchrl_etdmpc.training import TrainingRun, read_run_config
 
-DECAYS = (0.98, 0.995)
-COLUMNS = ("env_steps", "latest", *(f"average {decay}" for decay in DECAYS), "policy", "in training")
+DECAYS = (0.98, 0.995, 0.999)
+COMPARED = {
+    "averages": tuple(f"average {decay}" for decay in DECAYS),
+    "acting": ("elite", "mean", "exploring"),
+}
 
 
 @contextmanager
@@ -46,7 +55,26 @@ def weights_of(parameters: list[Tensor], weights: list[Tensor]) -> Iterator[None
         torch._foreach_copy_(parameters, own)
 
 
-def moments(run: TrainingRun, every: int, times: int) -> Iterator[list[str]]:
+@contextmanager
+def acting(planner: EnsembleMPPIPlanner, way: str) -> Iterator[None]:
+    """The evaluation's planner acts with another choice for a while, or as in training."""
+    forward = planner.forward
+
+    def explore(tensordict: TensorDictBase) -> TensorDictBase:
+        with set_exploration_type(ExplorationType.RANDOM):
+            return forward(tensordict)
+
+    own = planner.eval_first_action
+    if way == "exploring":
+        planner.forward = explore
+    else:
+        planner.eval_first_action = way
+    yield
+    planner.eval_first_action = own
+    vars(planner).pop("forward", None)
+
+
+def moments(run: TrainingRun, every: int, times: int, compared: str) -> Iterator[list[str]]:
     """A row per moment; ``every`` is in env steps."""
     parameters = [*run.learner.agent.world_model.parameters()]
     averages = {decay: [parameter.detach().clone() for parameter in parameters] for decay in DECAYS}
@@ -58,8 +86,14 @@ def moments(run: TrainingRun, every: int, times: int) -> Iterator[list[str]]:
             for decay, average in averages.items():
                 torch._foreach_lerp_(average, latest, 1 - decay)
         result, returns = run.evaluator(), []
-        for average in averages.values():
-            with weights_of(parameters, average):
+        planner = run.learner.agent.eval_planner
+        ways = (
+            [weights_of(parameters, average) for average in averages.values()]
+            if compared == "averages"
+            else [acting(planner, way) for way in COMPARED["acting"]]
+        )
+        for way in ways:
+            with way:
                 returns.append(run.evaluator().return_mean)
         policy, trained = result.policy_return, run.learner.pop_row()["episode_return"]
         numbers = (result.return_mean, *returns, math.nan if policy is None else policy, trained)
@@ -71,6 +105,7 @@ def main() -> None:
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--every", type=int, default=300, help="env steps")
     parser.add_argument("--times", type=int, default=8)
+    parser.add_argument("--compare", choices=[*COMPARED], default="averages")
     parser.add_argument("--out", type=Path, help="a CSV file")
     arguments = parser.parse_args()
     if min(arguments.every, arguments.times) < 1:
@@ -78,12 +113,12 @@ def main() -> None:
     if not RunDirectory(arguments.run_dir).holds_a_run:
         sys.exit(f"error: {arguments.run_dir} is not the directory of a run.")
     try:
-        compare(arguments.run_dir, arguments.every, arguments.times, arguments.out)
+        compare(arguments.run_dir, arguments.every, arguments.times, arguments.compare, arguments.out)
     except (CheckpointError, OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 
 
-def compare(run_dir: Path, every: int, times: int, out: Path | None) -> None:
+def compare(run_dir: Path, every: int, times: int, compared: str, out: Path | None) -> None:
     """Prints the table and writes it to ``out``, row by row."""
     if read_run_config(RunDirectory(run_dir)).optim.average_decay:
         raise ValueError("the run plans with averaged weights already; choose one with optim.average_decay=0.")
@@ -99,7 +134,8 @@ def compare(run_dir: Path, every: int, times: int, out: Path | None) -> None:
         run.checkpoints.restore()
         run.precompile()
         table = csv.writer(file, lineterminator="\n")
-        for row in itertools.chain([COLUMNS], moments(run, every, times)):
+        columns = ("env_steps", "latest", *COMPARED[compared], "policy", "in training")
+        for row in itertools.chain([columns], moments(run, every, times, compared)):
             print(*row, sep="\t", flush=True)
             table.writerow(row)
             file.flush()

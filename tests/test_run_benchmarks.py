@@ -54,11 +54,30 @@ def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, m
     with open(RunDirectory(tmp_path / "run").eval, newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
     # The weights of the checkpoint, in the episodes that the run played; the averages begin with them.
-    assert {rows[0][name] for name in script["COLUMNS"][1:4]} == {f"{float(last['return_mean']):.0f}"}
+    assert {rows[0][name] for name in ("latest", *script["COMPARED"]["averages"])} == {
+        f"{float(last['return_mean']):.0f}"
+    }
     assert any(row["in training"] for row in rows)
     assert all(row["policy"] for row in rows)
     assert len({row["average 0.98"] for row in rows}) > 1
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == files
+
+
+def test_a_moment_is_played_as_an_evaluation_and_as_in_training(tmp_path, monkeypatch):
+    train(tmp_path / "run")
+    script = runpy.run_path(str(BENCHMARKS / "moments.py"))
+    monkeypatch.setattr("sys.argv", [
+        "moments.py", str(tmp_path / "run"), "--every", "50", "--times", "1", "--compare", "acting",
+        "--out", str(tmp_path / "moments.csv"),
+    ])  # fmt: skip
+    script["main"]()
+    with open(tmp_path / "moments.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    with open(RunDirectory(tmp_path / "run").eval, newline="", encoding="utf-8") as file:
+        last = list(csv.DictReader(file))[-1]
+    assert rows[0]["latest"] == f"{float(last['return_mean']):.0f}"
+    ways = ("latest", *script["COMPARED"]["acting"])
+    assert all(len({row[way] for way in ways}) == len(ways) for row in rows)  # each acts in another way
 
 
 def test_what_moments_cannot_go_on_with_is_one_line(tmp_path, monkeypatch):
