@@ -229,6 +229,23 @@ def test_a_value_that_is_not_finite_is_no_return(key, value):
         evaluate(BrokenEnv(key, value), ConstantPolicy(), episodes=1)
 
 
+class BrokenLater(CountingEnv):
+    """Its first episode is whole; the first step of the next has no number."""
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        following = super()._step(tensordict)
+        if self.resets > 1:
+            following["reward"] = torch.full_like(following["reward"], torch.nan)
+        return following
+
+
+def test_what_follows_an_episode_that_counts_may_have_no_number():
+    env = SerialEnv(2, [partial(BrokenLater, 2), partial(CountingEnv, 5)])
+    assert evaluate(env, ConstantPolicy(), episodes=2).returns.tolist() == [expected_return(2), expected_return(5)]
+    with pytest.raises(NonFiniteError, match="non-finite 'reward' at decision step 1"):
+        evaluate(env, ConstantPolicy(), episodes=3)  # a second round, of which it counts
+
+
 def test_the_reward_may_have_another_name_and_must_be_one():
     env = CountingEnv(3)
     renamed = TransformedEnv(env, RenameTransform(["reward"], ["score"]))

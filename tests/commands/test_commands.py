@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -41,6 +42,16 @@ def test_the_wheel_s_command_is_the_examples_code():
     names = ("train", "train_dmc", "distributed", "evaluate", "export", "report", "suite", "study", "inspect_planner")
     for name in names:
         assert f'main("{name}")' in (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
+
+
+def test_a_folder_of_any_alphabet_can_be_named_where_output_is_ascii(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", "--version"])
+    with pytest.raises(SystemExit):
+        commands.main()
+    print("runs/größe", flush=True)
+    assert written.getvalue().endswith(b"runs/gr\\xf6\\xdfe\n")
 
 
 def test_the_wheel_holds_every_file_that_the_package_reads():

@@ -8,7 +8,17 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import ActionScaling, EnvBase, GymEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    ActionScaling,
+    CatFrames,
+    EnvBase,
+    GymEnv,
+    RewardScaling,
+    StepCounter,
+    TimeMaxPool,
+    TransformedEnv,
+)
+from torchrl.envs.transforms import VecNormV2
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 pytest.importorskip("dm_control")
@@ -228,6 +238,56 @@ def test_a_loaded_collector_goes_on_inside_the_episode(insertion, num_envs):
     wanted = buffer.storage[:][rows:].exclude("index")
     assert (resumed.storage[:].exclude("index") == wanted).all()
     assert len(resumed) == len(wanted) > 0
+
+
+REMEMBERING = {
+    "frames": lambda: CatFrames(N=3, dim=-1, in_keys=["observation"]),
+    "maximum": lambda: TimeMaxPool(in_keys=["observation"], T=3),
+    "statistics": lambda: VecNormV2(in_keys=["observation"]),
+    "constants": lambda: RewardScaling(0.0, 2.0),
+}
+
+
+def remembering(name: str, num_envs: int, seed: int = 3) -> EnvBase:
+    return make_env("cartpole-swingup", num_envs, parallel=False, seed=seed).append_transform(REMEMBERING[name]())
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size")
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_what_transforms_remember_goes_on_too(name, num_envs):
+    first, second = (remembering(name, num_envs, seed) for seed in (3, 4))
+    torch.manual_seed(0)
+    carrier = first.reset()
+    for _ in range(4):
+        _, carrier = step(first, carrier)
+    state, resumed = through_a_file(simulator_state(first)), carrier.clone()
+    torch.manual_seed(1)
+    expected = []
+    for _ in range(LIMIT):  # over a reset
+        stepped, carrier = step(first, carrier)
+        expected.append(stepped)
+    for _ in range(2):  # one that has not stepped yet, then one that remembers something else
+        assert load_simulator_state(second, state)
+        again = resumed.clone()
+        torch.manual_seed(1)
+        for wanted in expected:
+            stepped, again = step(second, again)
+            assert (stepped == wanted).all()
+
+
+def test_a_state_of_other_transforms_is_noticed():
+    first, fewer, larger = (
+        remembering("frames", 1),
+        make_env("cartpole-swingup", 1, parallel=False),
+        remembering("frames", 3),
+    )
+    for env in (first, fewer, larger):
+        env.rollout(3)
+    assert not load_simulator_state(fewer, simulator_state(first))
+    assert not load_simulator_state(first, simulator_state(fewer))
+    frames = simulator_state(first)["transforms"]
+    assert not load_simulator_state(larger, simulator_state(larger) | {"transforms": frames})
 
 
 def test_a_collector_whose_simulator_does_not_come_back_begins_fresh_episodes_and_says_so():

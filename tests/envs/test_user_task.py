@@ -5,6 +5,7 @@ import sys
 import pytest
 import torch
 from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs.transforms import VecNormV2
 
 pytest.importorskip("gymnasium")
 
@@ -21,6 +22,7 @@ _MORE = """
 import gymnasium
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.transforms import VecNormV2
 from torchrl_etdmpc.envs import Task, register_task
 
 def scaled(*transforms, base=None, **options):
@@ -29,6 +31,12 @@ def scaled(*transforms, base=None, **options):
         env = env.append_transform(transform)
     return env
 
+def normed(): return scaled(VecNormV2(in_keys=["observation"]), StepCounter(30))
+def frozen():
+    env = normed()
+    env.rollout(3)
+    env.transform[-2].freeze()
+    return env
 def limited(): return scaled(StepCounter(30))
 def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
 def unlimited(): return scaled(base=GymWrapper(PendulumEnv()))
@@ -204,6 +212,15 @@ def test_a_users_environment_cannot_be_brought_back(folder):
         env = make_env(import_task("my_file:make_my_env"), seed=0, **options)
         env.rollout(3)
         assert simulator_state(env) is None
+
+
+def test_statistics_that_move_in_every_copy_are_refused_unless_they_are_frozen(folder):
+    with pytest.raises(
+        ValueError, match=r"^task 'more_tasks:normed': VecNormV2 has .* model\.normalize_observations=true"
+    ):
+        make_env(import_task("more_tasks:normed"), num_envs=2, parallel=False)
+    env = make_env(import_task("more_tasks:frozen"))
+    assert any(isinstance(transform, VecNormV2) for transform in env.transform)
 
 
 def test_a_users_own_transforms_stay(folder):

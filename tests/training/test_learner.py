@@ -135,6 +135,33 @@ def test_a_row_counts_the_planned_decisions_whose_plan_fell_back(tmp_path, tiny_
     assert ("plan", "fallback") not in learner.replay[:].keys(True, True)
 
 
+@pytest.mark.parametrize("reward", [50.0, 60.0, -60.0])
+def test_rewards_that_the_bins_cannot_say_are_told_once(tmp_path, reward, tiny_config, make_run):
+    def pay(after: TensorDictBase) -> None:
+        after["reward"] = torch.full_like(after["reward"], reward)
+
+    config = tiny_config(model={"bin_min": -4.0, "bin_max": 4.0})  # to e^4 - 1
+    learner = make_run(config, tmp_path, AtSomeSteps(pay, 3, 4)).learner
+    said = pytest.warns(UserWarning, match=r"^rewards lie outside \[-53\.6, 53\.6\], all that the bins can say")
+    with said if abs(reward) > 53.6 else contextlib.nullcontext() as warned:
+        for _ in range(5):
+            learner.step()
+    assert warned is None or len(warned) == 1
+
+
+def test_value_targets_that_the_bins_cannot_say_are_told(tmp_path, tiny_config, make_run):
+    def pay(after: TensorDictBase) -> None:
+        after["reward"] = torch.full_like(after["reward"], 50.0)  # one is within, two are not
+
+    config = tiny_config(model={"bin_min": -4.0, "bin_max": 4.0}, loss={"value_replayed": 1.0})
+    learner = make_run(config, tmp_path, AtSomeSteps(pay, *range(1, 40))).learner
+    for _ in range(30):
+        learner.step()
+    learner.step(updates=True)
+    with pytest.warns(UserWarning, match=r"^value targets lie outside"):
+        assert learner.pop_row()["value_target"] > 53.6
+
+
 def test_the_return_in_a_row_is_that_of_the_episodes_that_ended_in_it(tmp_path, tiny_config, make_run):
     learner = make_run(tiny_config(num_envs=2, total_env_steps=400), tmp_path).learner
     returns = []

@@ -408,6 +408,26 @@ def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path, tiny_confi
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 160]
 
 
+def test_a_run_whose_last_evaluation_fails_has_no_final_return(tmp_path, tiny_config, make_run, read_table):
+    run = make_run(tiny_config(), tmp_path)
+    play, calls = run.evaluator.env.step_and_maybe_reset, []
+
+    def break_at_the_end(tensordict: TensorDictBase):
+        calls.append(1)
+        if len(calls) > 2 * EPISODE:
+            raise RuntimeError("no more of it")
+        return play(tensordict)
+
+    run.evaluator.env.step_and_maybe_reset = break_at_the_end
+    with pytest.warns(UserWarning, match=r"^the evaluation at 160 env steps failed"):
+        summary = run.run()
+    evaluations = [row["return_mean"] for row in read_table(tmp_path / "eval.csv")]
+    assert len(evaluations) == 2
+    assert math.isnan(summary["final_return"])
+    assert summary["best_return"] == max(evaluations)
+    assert json.loads((tmp_path / "summary.json").read_text())["final_return"] is None
+
+
 def test_an_evaluation_that_fails_before_anything_was_learned_is_an_error(tmp_path, tiny_config, make_run):
     run = make_run(tiny_config(), tmp_path)
 

@@ -118,8 +118,8 @@ def _round(
             outputs = policy(inputs).select(*policy.out_keys, strict=False)
             tensordict = tensordict.update(outputs.to(env.device or "cpu"))
         stepped, tensordict = env.step_and_maybe_reset(tensordict)
-        _require_finite(stepped.get("next"), (reward, *observed), int(length.max()) + 1)
         following = stepped.get("next")
+        _require_finite(following, (reward, *observed), running, int(length.max()) + 1)
         total += torch.where(running, following.get(reward).reshape(num_envs).cpu(), 0)
         length += running
         running &= ~following.get(done).reshape(num_envs).cpu()
@@ -128,8 +128,12 @@ def _round(
     return Episodes(total, length)
 
 
-def _require_finite(following: TensorDictBase, keys: Iterable[NestedKey], decisions: int) -> None:
+def _require_finite(following: TensorDictBase, keys: Iterable[NestedKey], running: Tensor, decisions: int) -> None:
+    """Of the environments whose episode counts still; what the others do is thrown away."""
     for key in keys:
         value = following.get(key)
-        if value is not None and value.is_floating_point() and not value.isfinite().all():
+        if value is None or not value.is_floating_point():
+            continue
+        finite = value.isfinite().reshape(len(running), -1).all(-1).cpu()
+        if not finite[running].all():
             raise NonFiniteError(f"the environment returned a non-finite {key!r} at decision step {decisions}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import signal
 import sys
@@ -42,6 +43,8 @@ def main(command: str | None = None) -> None:
     ...     main()
     torchrl-etdmpc ...
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # the last line of a run may name a folder in any alphabet
     if command is None:
         command = _first_argument()
     _choose_renderer(command, sys.argv[1:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +11,15 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.parameter import UninitializedBuffer
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 __all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
+
+_TRANSFORMS = "transforms"
+"""Where a state has what the transforms around the simulator remember, by their place."""
 
 
 class RecordedEnv(EnvBase):
@@ -151,11 +156,14 @@ class RecordedEnv(EnvBase):
 def simulator_state(env: EnvBase) -> dict[str, Any] | None:
     """What :func:`load_simulator_state` needs to bring an environment back to where it is now.
 
+    What transforms remember beside the tensordict is part of it (the frames of ``CatFrames``, the statistics of
+    ``VecNormV2``), if their ``state_dict`` has it.
+
     Args:
         env (EnvBase): batched or not, with any transforms around it.
 
     Returns:
-        dict, optional: tensors only, or ``None`` if the environment cannot be restored.
+        dict, optional: tensors and plain numbers only, or ``None`` if the environment cannot be restored.
 
     >>> from torchrl_etdmpc.envs import make_env
     >>> env = make_env("gym/Pendulum-v1", seed=0)
@@ -173,7 +181,10 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
             return None
     state = simulator.state_dict()
     workers = list(state.values()) if isinstance(simulator, BatchedEnvBase) else [state]
-    return dict(state) if all(worker.get("_extra_state") is not None for worker in workers) else None
+    remembered = _transform_states(env)
+    if not _is_plain(remembered) or any(worker.get("_extra_state") is None for worker in workers):
+        return None
+    return {**state, _TRANSFORMS: remembered} if remembered else dict(state)
 
 
 def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
@@ -195,7 +206,11 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
     if state is None:
         return False
     simulator = _simulator(env)
-    simulator.load_state_dict(state)
+    simulator.load_state_dict({name: part for name, part in state.items() if name != _TRANSFORMS})
+    try:
+        _load_transform_states(env, state.get(_TRANSFORMS, {}))
+    except (RuntimeError, LookupError):  # made in another way than the one that was saved
+        return False
     # TorchRL 0.14: a ParallelEnv's workers report that they are done twice, and the next step would not wait for them.
     flags = simulator.__dict__.get("_shm_done_flags")
     if flags is not None:
@@ -209,6 +224,45 @@ def _simulator(env: EnvBase) -> EnvBase:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
+
+
+def transforms_of(env: EnvBase) -> list[Transform]:
+    """Every transform above the simulator, the outermost environment's first."""
+    found: list[Transform] = []
+    while isinstance(env, TransformedEnv):
+        found += env.transform if isinstance(env.transform, Compose) else [env.transform]
+        env = env.base_env
+    return found
+
+
+def _transform_states(env: EnvBase) -> dict[str, Any]:
+    """What the transforms remember, of those that do: buffers and extra state, not the weights of networks."""
+    states = {}
+    for place, transform in enumerate(transforms_of(env)):
+        if any(isinstance(buffer, UninitializedBuffer) for buffer in transform.buffers()):
+            continue  # it holds nothing before the first step, and cannot tell so
+        weights = {name for name, _ in transform.named_parameters()}
+        state = {name: part for name, part in transform.state_dict().items() if name not in weights}
+        if any(part is not None for part in state.values()):
+            states[str(place)] = copy.deepcopy(state)  # statistics move on in place
+    return states
+
+
+def _load_transform_states(env: EnvBase, states: dict[str, Any]) -> None:
+    transforms = transforms_of(env)
+    for place, state in states.items():
+        transform = transforms[int(place)]
+        for name, buffer in transform.named_buffers():
+            if isinstance(buffer, UninitializedBuffer):
+                buffer.materialize(state[name].shape, device=env.device, dtype=state[name].dtype)
+        transform.load_state_dict(copy.deepcopy(state), strict=False)  # its weights stay
+
+
+def _is_plain(state: Any) -> bool:
+    """Whether a file of weights alone may hold it."""
+    if isinstance(state, dict):
+        return all(_is_plain(part) for part in state.values())
+    return state is None or isinstance(state, Tensor | str | int | float)
 
 
 def _equal(one: Any, other: Any) -> bool:

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv
+from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv, VecNorm
+from torchrl.envs.transforms import VecNormV2
 
 from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.dmc import dmc_maker
+from torchrl_etdmpc.envs.episode import transforms_of
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
 from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
@@ -60,8 +62,8 @@ def make_env(
 
     Raises:
         ImportError: if the suite is missing, or cannot work with what is installed.
-        ValueError: if the task or its suite is unknown, if its environment does not keep the contract, or if
-            ``num_envs`` is below 1.
+        ValueError: if the task or its suite is unknown, if its environment does not keep the contract or normalises by
+            statistics that move, or if ``num_envs`` is below 1.
         RuntimeError: if a process ended before its environment was made.
 
     >>> from torchrl_etdmpc.envs import make_env
@@ -125,6 +127,13 @@ def _make_one(make: Maker, task: Task, *, device: torch.device | str) -> EnvBase
         raise ValueError(f"the maker of task {task.name!r} must return a TorchRL environment, got {env!r}.")
     if env.batch_size:
         raise ValueError(f"task {task.name!r} must be a single environment, got batch size {list(env.batch_size)}.")
+    for transform in transforms_of(env):
+        if isinstance(transform, VecNorm | VecNormV2) and not transform.frozen:
+            raise ValueError(
+                f"task {task.name!r}: {type(transform).__name__} has statistics that move, other ones in every copy of "
+                "the environment, so training and evaluation would see different numbers; freeze() them, or leave it "
+                "out and set model.normalize_observations=true, whose statistics are the agent's."
+            )
     # The two entries that can be added without guessing.
     for key, transform in (("is_init", InitTracker), ("episode_reward", RewardSum)):
         if env.full_observation_spec.get(key, None) is None:

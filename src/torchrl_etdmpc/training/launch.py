@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import multiprocessing
 import warnings
 from collections.abc import Iterable, Mapping
@@ -153,8 +154,10 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
                 worker.kill()  # one that is just starting would complain that its owner has gone
             state = "with nothing to save" if plan.action == "begin" else f"{plan.directory} goes on from where it was"
             raise RunInterrupted(f"stopped before the first step, {state}; start it again.") from None
+    last = summary["final_return"]
+    outcome = "the last evaluation failed" if math.isnan(last) else f"return {last:.1f}"
     return (
-        f"{plan.config.task}: return {summary['final_return']:.1f} after {summary['env_steps']} env steps in "
+        f"{plan.config.task}: {outcome} after {summary['env_steps']} env steps in "
         f"{summary['wall_time_s']:.0f} s; curve, tables and checkpoint are in {plan.directory}"
     )
 

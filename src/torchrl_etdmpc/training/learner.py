@@ -59,6 +59,7 @@ class Learner:
         self.collector = build_collector(config, self.agent, env, self.replay)
         self.pretrained = self.faults = self.faults_in_a_row = 0
         self._updates, self._decisions = IntervalMeans(), IntervalMeans()
+        self._range_noted = False
 
     @property
     def env_steps(self) -> int:
@@ -85,6 +86,9 @@ class Learner:
         except (NonFiniteError, SimulatorError) as error:
             self._count_fault(error)
             return False
+        if not self._range_noted:
+            reward = stepped["next", "reward"]
+            self._note_range("rewards", reward.min().item(), reward.max().item())
         self._note_episodes(stepped)
         if updates:
             self._decisions.add({"plan_fallbacks": stepped["plan", "fallback"].float().mean()})
@@ -98,6 +102,18 @@ class Learner:
         age = stepped.get(WEIGHT_AGE, None)
         if age is not None and (age >= 0).any():
             self._decisions.add({"weight_age": age[age >= 0].float().mean()})
+
+    def _note_range(self, what: str, least: float, most: float) -> None:
+        """Says once that something is beyond the bins, where the losses do not show that it is cut."""
+        model = self.config.model
+        low, high = (math.copysign(math.expm1(abs(end)), end) for end in (model.bin_min, model.bin_max))
+        if (least < low or most > high) and not self._range_noted:
+            self._range_noted = True
+            warnings.warn(
+                f"{what} lie outside [{low:.3g}, {high:.3g}], all that the bins can say, and are cut there; scale the "
+                "rewards down (RewardScaling in the task), or widen model.bin_min and model.bin_max.",
+                stacklevel=3,
+            )
 
     def _note_episodes(self, stepped: TensorDictBase) -> None:
         done = stepped["next", "done"]
@@ -163,6 +179,8 @@ class Learner:
                 "planner.beta, optim.lr or optim.grad_clip_norm may help.",
                 stacklevel=2,
             )
+        if "value_target" in row:
+            self._note_range("value targets", row["value_target"], row["value_target"])
         row |= {"simulator_faults": self.faults, "updates_skipped": int(self.agent.updater.skipped)}
         if self.reanalyze is not None:
             row.setdefault("target_age", math.nan)

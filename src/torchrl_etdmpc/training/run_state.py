@@ -18,7 +18,7 @@ class RunState:
     Attributes:
         stage (str): ``"random"`` phase, then ``"pretrain"``, then ``"learn"``.
         due (list of str): what the last step called for and is not done yet, in order. These names are stored.
-        eval_returns (list of float): mean return of every evaluation so far.
+        eval_returns (list of float): mean return of every evaluation so far; NaN for one that failed.
         learning_s (float): seconds of acting and updating, without random phase, pretraining and evaluations.
         wall_s (float): seconds of work before this process.
     """

@@ -247,6 +247,7 @@ class TrainingRun:
                 f"the evaluation at {self.env_steps} env steps failed ({first_line(error)}); training goes on.",
                 stacklevel=2,
             )
+            self.state.eval_returns.append(math.nan)
             return
         self.state.eval_returns.append(result.return_mean)
         self.best.note(result.return_mean)
@@ -265,6 +266,7 @@ class TrainingRun:
     def summary(self) -> dict[str, Any]:
         """What the run came to."""
         state, device = self.state, self.learner.agent.device
+        evaluated = [value for value in state.eval_returns if not math.isnan(value)]
         learned = self.learner.collector.frames - self.config.seed_decisions
         return {
             "task": self.config.task,
@@ -272,7 +274,7 @@ class TrainingRun:
             "seed": self.config.seed,
             "env_steps": self.env_steps,
             "final_return": state.eval_returns[-1] if state.eval_returns else math.nan,
-            "best_return": max(state.eval_returns, default=math.nan),
+            "best_return": max(evaluated, default=math.nan),
             "wall_time_s": self.counters()["wall_time_s"],
             "compile_s": round(self._compile_s, 2),
             "decisions_per_second": learned / state.learning_s if state.learning_s else math.nan,
