@@ -1,12 +1,13 @@
 """All tasks of a benchmark with a preset at full size: build, collect, plan, reanalyze, update for a handful of steps.
 
     python benchmarks/all_tasks.py                              # DMC's 28, about fifteen minutes on two cores
-    python benchmarks/all_tasks.py --tasks dog-run humanoid-run --preset bmpc
+    python benchmarks/all_tasks.py --tasks dog-run humanoid-run --preset bmpc --out part.csv
     .venv-humanoidbench/bin/python benchmarks/all_tasks.py --benchmark humanoidbench
 
 Checks that everything is finite; where episodes can end early, how many did in the random phase, and that their head
 learns. Prints a row per task; writes `benchmarks/results/<device>/all_tasks.csv`, all_tasks_humanoidbench.csv for
-HumanoidBench. Exits with 1 if a task fails. Times are of the first call, in eager mode.
+HumanoidBench, or what ``--out`` names, which some of the tasks or another preset need. A task that fails has no row;
+then it exits with 1. Times are of the first call, in eager mode.
 """
 
 from __future__ import annotations
@@ -121,12 +122,15 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", help="default: all of the benchmark")
     parser.add_argument("--preset", help="default: efficient-tdmpc-utd4, or humanoidbench")
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--out", type=Path, help="a CSV file; default: the benchmark's, for all tasks and its preset")
     arguments = parser.parse_args()
+    if arguments.out is None and (arguments.tasks or arguments.preset):
+        sys.exit("error: --tasks and --preset make another table than the committed one; name a file for it by --out.")
     device = resolve_device(arguments.device)
     name = "cpu" if device.type == "cpu" else torch.cuda.get_device_name(device).lower().replace(" ", "-")
     file_name, tasks, preset_name, columns = BENCHMARKS[arguments.benchmark]
     tasks, preset_name = arguments.tasks or tasks, arguments.preset or preset_name
-    path = ROOT / "benchmarks" / "results" / name / f"{file_name}.csv"
+    path = arguments.out or ROOT / "benchmarks" / "results" / name / f"{file_name}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
     failed = 0
     with path.open("w", newline="") as file:
@@ -143,7 +147,7 @@ def main() -> None:
             writer.writerow(row)
             file.flush()
             print(" ".join(f"{row[column]!s:>12}" for column in columns), flush=True)
-    print(f"{len(tasks) - failed} of {len(tasks)} tasks passed; rows are in {path.relative_to(ROOT)}")
+    print(f"{len(tasks) - failed} of {len(tasks)} tasks passed; rows are in {path}")
     sys.exit(1 if failed else 0)
 
 

@@ -8,15 +8,16 @@
 *kills*: small runs with one environment, three environments, and compilation, each started with `resume=auto` until it
 has finished, and stopped by SIGKILL, SIGTERM, SIGINT or SIGUSR1 at random moments. Nothing may print a traceback, hang,
 or end with an unknown code; at the end curves, weights, best weights and buffer must be those of a run left alone.
-*flips*: one bit anywhere in the directory of a run; what is restored must be the newest checkpoint or an older one, to
-the last bit, or an error in one line. *settings*: values that make no sense, drawn as in
-`tests/commands/test_random_settings.py`. All write to `benchmarks/results/cpu/faults/`. POSIX only.
+*flips*: one bit anywhere in the directory of a run; what a new run restores must be what the run was at its newest
+checkpoint or the one before, to the last bit, or an error in one line. *settings*: values that make no sense, drawn as
+in `tests/commands/test_random_settings.py`. All write to `benchmarks/results/cpu/faults/`. POSIX only.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import csv
 import dataclasses
 import importlib.util
@@ -41,10 +42,18 @@ from cpu_learning import RESULTS, ROOT
 from torch import Tensor
 from torchrl import torchrl_logger
 
-from torchrl_etdmpc.checkpoints import CheckpointError
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions
-from torchrl_etdmpc.training import EXIT_CODE, TrainConfig, TrainingRun, plan_launch, read_agent_file
+from torchrl_etdmpc.training import (
+    EXIT_CODE,
+    TrainConfig,
+    TrainingRun,
+    build_replay,
+    plan_launch,
+    read_agent_file,
+    read_run_config,
+)
 
 SETTINGS = {
     "task": "cartpole-balance",
@@ -110,9 +119,9 @@ def results(run_dir: Path) -> dict[str, Any]:
     for file in (directory.last_agent, directory.best_agent):
         content = read_agent_file(file)
         answer[file.name] = plain({name: content[name] for name in ("loss", "world_model", "updater", "counters")})
-    newest = max((directory.checkpoints / "resume").glob("[0-9]*"))
-    replay = json.loads((newest / "manifest.json").read_text())["replay"]
-    answer["buffer"] = replay["written"]
+    buffer = build_replay(read_run_config(directory))
+    CheckpointStore(directory.checkpoints).load({}, buffer)  # the rows, as a run that goes on has them
+    answer["buffer"] = plain({"rows": buffer.storage[:].to_dict(), "writer": buffer.writer.state_dict()})
     return answer
 
 
@@ -215,10 +224,31 @@ def make_run(config: TrainConfig, run_dir: Path) -> TrainingRun:
 
 
 def state(run: TrainingRun) -> Any:
+    """Everything of a run and its files that a checkpoint brings back, the generators apart."""
     parts = {name: plain(part.state_dict()) for name, part in run.parts.items() if name != "random"}
     directory = run.log.directory
     files = {file.name: file.read_bytes() if file.exists() else b"" for file in (directory.train, directory.eval)}
-    return parts, plain(run.learner.replay[:].to_dict()), files, read_agent_file(directory.best_agent)["counters"]
+    best = plain(read_agent_file(directory.best_agent)["counters"])
+    return parts, plain(run.learner.replay.storage[:].to_dict()), files, best
+
+
+def train(config: TrainConfig, run_dir: Path) -> list[Any]:
+    """A whole run, left as if it had not finished; its states when it wrote its last checkpoints, the newest first."""
+    run, states = make_run(config, run_dir), []
+    save = run.checkpoints.store.save
+
+    def save_and_note(*arguments: Any, **options: Any) -> Path:
+        folder = save(*arguments, **options)
+        if run.log.directory.best_agent.exists():  # not yet at the first one
+            states.insert(0, state(run))
+        return folder
+
+    run.checkpoints.store.save = save_and_note
+    run.log.directory.begin(config.to_dict())
+    run.run()
+    run.log.directory.close()
+    RunDirectory(run_dir).summary.unlink()  # so that there is something to go on with
+    return states[: config.checkpoint_keep]
 
 
 def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
@@ -226,14 +256,20 @@ def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
     run_dir = folder / "run"
     config = configuration({"compile": "off", "run_dir": str(run_dir), "resume": "on", "total_env_steps": 200})
     whole = folder / "whole"
-    run = make_run(config, run_dir)
-    run.log.directory.begin(config.to_dict())
-    run.run()
-    run.log.directory.close()
-    RunDirectory(run_dir).summary.unlink()  # so that there is something to go on with
+    states = train(config, run_dir)
     shutil.copytree(run_dir, whole)
     files = sorted(path for path in whole.rglob("*") if path.is_file() and path.name != "curve.png")
-    run = make_run(config, run_dir)
+    run = make_run(config, run_dir)  # has other weights and no counts: nothing of what it is to restore
+    made = {name: copy.deepcopy(part.state_dict()) for name, part in run.parts.items() if name != "random"}
+
+    def forget() -> None:
+        """Makes the run what it was before it restored anything, and its directory whole again."""
+        run.learner.replay.empty()
+        run.learner.collector.env.reset()
+        for name, values in made.items():
+            run.parts[name].load_state_dict(copy.deepcopy(values))
+        shutil.rmtree(run_dir)
+        shutil.copytree(whole, run_dir)
 
     def restored(**changes: Any) -> Any:
         run.config = run.checkpoints.config = plan_launch(dataclasses.replace(config, **changes), changes).config
@@ -247,14 +283,11 @@ def flips(number: int, seed: int, folder: Path) -> dict[str, Any]:
             directory.close()
         return run.config.to_dict(), state(run)
 
-    expected = [restored()]
-    newest = max((run_dir / "checkpoints" / "resume").iterdir())
-    shutil.rmtree(newest)
-    expected.append(restored())
+    settings = plan_launch(config, {}).config.to_dict()
+    expected = [(settings, values) for values in states]
     by_file: Counter[str] = Counter()
     for count in range(number):
-        shutil.rmtree(run_dir)
-        shutil.copytree(whole, run_dir)
+        forget()
         source = chance.choice(files)
         target = run_dir / source.relative_to(whole)
         data = bytearray(source.read_bytes())

@@ -3,15 +3,17 @@
     python benchmarks/frozen_agents.py runs/cpu-all/cpu/*/seed* --out frozen_agents.csv
 
 Plays episodes from the last checkpoint of every run: with the planner as the run evaluates it, with one change to it at
-a time, and with the policy alone. All play the same starts, which no evaluation of a run has. Writes a row per agent
-and setting; an ``--out`` that is there already is gone on with. Then prints what each change does to the return: its
-mean over agents and a 95% interval (t).
+a time, and with the policy alone. All play the same starts, which no evaluation of a run has. Writes a row per run,
+whose directory is named as seen from the table's, and setting; an ``--out`` that is there already is gone on with, if
+all of its rows are of these runs. Then prints what each change does to the return: its mean over agents and a 95%
+interval (t).
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import sys
 from pathlib import Path
 
@@ -40,7 +42,7 @@ CHANGES = {
     "beta 3": {"beta": 3.0},
     POLICY: {},
 }
-COLUMNS = ["task", "seed", "setting", "return_mean", "return_std", "episodes"]
+COLUMNS = ["run", "task", "seed", "setting", "return_mean", "return_std", "episodes"]
 
 
 def play(run: RunDirectory, setting: str, episodes: int) -> Episodes:
@@ -65,11 +67,17 @@ def measure(runs: list[RunDirectory], settings: list[str], episodes: int, out: P
     table = pd.read_csv(out) if out.is_file() else pd.DataFrame(columns=COLUMNS)
     if (table["episodes"] != episodes).any():
         raise ValueError(f"{out} has other numbers of episodes than {episodes}; choose another --out.")
+    names = [Path(os.path.relpath(run.path.resolve(), out.parent.resolve())).as_posix() for run in runs]
     agents = [read_run_config(run) for run in runs]
-    keys = [(config.task, config.seed) for config in agents]
-    if len(set(keys)) < len(keys):
+    keys = [(name, config.task, config.seed) for name, config in zip(names, agents, strict=True)]
+    if len({key[1:] for key in keys}) < len(keys):
         raise ValueError("several runs have the same task and seed; name the runs of one variant at a time.")
-    done = set(table[COLUMNS[:3]].itertuples(index=False, name=None))
+    if "run" not in table:
+        raise ValueError(f"{out} does not say which runs its rows are of; choose another --out.")
+    others = [name for name in table["run"] if name not in names]
+    if others:
+        raise ValueError(f"{out} has rows of another run, {others[0]}; name that run too, or choose another --out.")
+    done = set(table[COLUMNS[:4]].itertuples(index=False, name=None))
     todo = [(run, (*key, setting)) for setting in settings for run, key in zip(runs, keys, strict=True)]
     for run, key in todo:
         if key in done:

@@ -5,7 +5,7 @@
 
 Plays whole episodes of the random phase (`SeedPolicy`), the same starts with every hold. ``return`` is the mean of the
 episodes, ``found`` in how many of them something was paid after their first 25 decisions, what a lucky start pays left
-out. Writes `benchmarks/results/cpu/random_phase.csv` or what ``--out`` names.
+out. Writes `benchmarks/results/cpu/random_phase.csv`, or for other tasks, holds or episodes what ``--out`` names.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ TASKS = (
     *("pendulum-swingup", "quadruped-walk", "reacher-hard", "walker-walk"),
 )
 HOLDS = (1.0, 4.0, 8.0, 16.0)
+EPISODES = 24
 START = 25
 COLUMNS = ["task", "hold", "return", "found", "episodes"]
 
@@ -43,11 +44,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=TASKS, choices=DMC_TASKS, metavar="TASK")
     parser.add_argument("--holds", nargs="+", type=float, default=HOLDS)
-    parser.add_argument("--episodes", type=int, default=24)
-    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--episodes", type=int, default=EPISODES)
+    parser.add_argument("--out", type=Path, help=f"a CSV file; default: {OUT.name} of the results")
     arguments = parser.parse_args()
     if arguments.episodes < 1 or not all(hold >= 1 for hold in arguments.holds):
         sys.exit("error: --episodes and --holds must be at least 1.")
+    asked = tuple(arguments.tasks), tuple(arguments.holds), arguments.episodes
+    if arguments.out is None and asked != (TASKS, HOLDS, EPISODES):
+        sys.exit("error: other tasks, holds or episodes make another table than the committed one; name it by --out.")
     rows = []
     for task in arguments.tasks:
         for hold in arguments.holds:
@@ -55,7 +59,7 @@ def main() -> None:
             found = int((rewards[:, START:] > 0).any(-1).sum())
             rows.append([task, hold, round(rewards.sum(-1).mean().item(), 2), found, arguments.episodes])
             print(*rows[-1], flush=True)
-    pd.DataFrame(rows, columns=COLUMNS).to_csv(arguments.out, index=False)
+    pd.DataFrame(rows, columns=COLUMNS).to_csv(arguments.out or OUT, index=False)
 
 
 if __name__ == "__main__":

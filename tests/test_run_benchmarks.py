@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import runpy
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
+from torchrl_etdmpc.checkpoints import CheckpointStore
 from torchrl_etdmpc.inspector import play_episode
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.training import TrainConfig, launch, load_agent, preset
+from torchrl_etdmpc.training import TrainConfig, build_replay, launch, load_agent, preset, read_run_config
+from torchrl_etdmpc.training.learner import Learner
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SMALL = {
@@ -103,6 +107,7 @@ def test_agents_play_with_other_settings_of_the_planner(tmp_path, monkeypatch, c
     monkeypatch.setattr("sys.argv", command)
     script["main"]()
     first = pd.read_csv(out)
+    assert list(first["run"]) == ["seed1", "seed2"] * 2  # wherever the machine has them
     assert list(first["setting"]) == ["as trained"] * 2 + ["elite"] * 2
     assert set(first["seed"]) == {1, 2}
     assert (first["episodes"] == 3).all()
@@ -127,6 +132,21 @@ def test_agents_play_with_other_settings_of_the_planner(tmp_path, monkeypatch, c
     monkeypatch.setattr("sys.argv", [command[0], runs[0], *command[1:]])
     with pytest.raises(SystemExit, match="several runs have the same task and seed"):
         script["main"]()
+
+
+def test_frozen_agents_goes_on_with_a_table_of_the_same_runs_alone(tmp_path):
+    script, out, run = runpy.run_path(str(BENCHMARKS / "frozen_agents.py")), tmp_path / "out.csv", tmp_path / "run"
+    run.mkdir()
+    RunDirectory(run).write_config(preset("cpu").to_dict() | {"task": "walker-walk", "seed": 1})
+    columns = ["task", "seed", "setting", "return_mean", "return_std", "episodes"]
+    table = pd.DataFrame([("walker-walk", 1, "as trained", 100.0, 1.0, 3)], columns=columns)
+    for rows, message in (
+        (table.assign(run="other"), "has rows of another run, other; name that run too, or choose another --out"),
+        (table, "does not say which runs its rows are of; choose another --out"),
+    ):
+        rows.to_csv(out, index=False)
+        with pytest.raises(ValueError, match=message):
+            script["measure"]([RunDirectory(run)], ["as trained"], 3, out)
 
 
 def test_frozen_agents_refuses_what_it_cannot_play(tmp_path, monkeypatch):
@@ -226,3 +246,64 @@ def test_what_random_actions_find_is_counted_from_the_same_starts_behind_their_b
         monkeypatch.setattr("sys.argv", ["random_phase.py", *wrong])
         with pytest.raises(SystemExit, match="--episodes and --holds must be at least 1"):
             script["main"]()
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("all_tasks", ["--tasks", "walker-walk"]),
+        ("all_tasks", ["--preset", "bmpc"]),
+        ("random_phase", ["--tasks", "reacher-easy"]),
+        ("random_phase", ["--holds", "1"]),
+        ("random_phase", ["--episodes", "2"]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[0],
+)
+def test_a_part_of_a_committed_table_needs_a_file_of_its_own(monkeypatch, name, options):
+    main = runpy.run_path(str(BENCHMARKS / f"{name}.py"))["main"]
+    monkeypatch.setattr("sys.argv", [f"{name}.py", *options])
+    with pytest.raises(SystemExit, match="another table than the committed one; name .* by --out"):
+        main()
+
+
+def test_a_task_that_fails_has_no_row_and_is_the_exit_code(tmp_path, monkeypatch, capsys):
+    main = runpy.run_path(str(BENCHMARKS / "all_tasks.py"))["main"]
+
+    def exercise(task: str, *_: object) -> dict[str, str]:
+        if task == "dog-run":
+            raise RuntimeError("not finite: loss_value")
+        return dict.fromkeys(main.__globals__["COLUMNS"], "7") | {"task": task}
+
+    monkeypatch.setitem(main.__globals__, "exercise", exercise)
+    for tasks, code in ((["walker-walk", "dog-run"], 1), (["walker-walk"], 0)):
+        monkeypatch.setattr("sys.argv", ["all_tasks.py", "--tasks", *tasks, "--out", str(tmp_path / "out.csv")])
+        with pytest.raises(SystemExit) as left:
+            main()
+        assert left.value.code == code
+        assert pd.read_csv(tmp_path / "out.csv")["task"].tolist() == ["walker-walk"]
+    assert "dog-run: RuntimeError: not finite: loss_value" in capsys.readouterr().out
+
+
+@pytest.fixture
+def faults(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module("faults")
+
+
+def test_what_a_killed_run_came_to_includes_the_rows_of_its_buffer(tmp_path, faults):
+    train(tmp_path / "run")
+    directory = RunDirectory(tmp_path / "run")
+    expected = faults.results(tmp_path / "run")
+    assert faults.results(tmp_path / "run") == expected
+    buffer = build_replay(read_run_config(directory))
+    CheckpointStore(directory.checkpoints).load({}, buffer)
+    buffer.storage[:]["next", "reward"][7] += 1
+    CheckpointStore(directory.checkpoints).save(1000, {}, buffer)
+    found = faults.results(tmp_path / "run")
+    assert [name for name in expected if found[name] != expected[name]] == ["buffer"]
+
+
+def test_flipped_bits_are_judged_on_a_run_that_does_not_hold_the_answer(tmp_path, faults, monkeypatch):
+    monkeypatch.setattr(Learner, "load_state_dict", lambda self, state_dict: None)
+    complaints = faults.flips(3, 1, tmp_path)["complaints"]
+    assert complaints and all("restored something else" in text for text in complaints)

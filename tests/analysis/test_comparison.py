@@ -10,7 +10,14 @@ pytest.importorskip("pandas")
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
-from torchrl_etdmpc.analysis import AGGREGATE, Comparison, compare, get_benchmark, merge_estimates  # noqa: E402
+from torchrl_etdmpc.analysis import (  # noqa: E402
+    AGGREGATE,
+    Comparison,
+    compare,
+    evaluated_methods,
+    get_benchmark,
+    merge_estimates,
+)
 
 EASY = get_benchmark("dmc-easy")  # budget 200,000
 TASKS = ("walker-walk", "walker-run")
@@ -188,6 +195,30 @@ def test_a_smaller_budget_still_normalises_by_the_benchmarks():
     assert comparison.budget == comparison.grid[-1] == 100_000
     assert cell(comparison.finals, "BMPC", AGGREGATE)["mean"] == pytest.approx(0.5)
     assert cell(comparison.areas, "BMPC", AGGREGATE)["auc"] == pytest.approx(0.1 * 0.25)
+
+
+def test_quoted_points_count_up_to_a_smaller_budget_and_variants_are_paired_there():
+    quotes = {"method": "quoted", "task": "walker-walk", "env_steps": [100_000, 150_000], "mean": 1.0, "source": "p"}
+    ahead = seed_curves("ahead", lambda seed, task, step: ours(seed, task, step) + step)
+    options = {"points": pd.DataFrame(quotes), "base": "ours", "variants": ["ahead"]}
+    comparison = run(pd.concat([OURS, ahead]), budget=100_000, **options)
+    assert comparison.points["env_steps"].tolist() == [100_000]
+    differences = comparison.paired.set_index("task")["difference"]
+    assert differences[[*TASKS]].tolist() == pytest.approx([100_000] * 2)
+
+
+def test_returns_at_the_budget_may_lie_on_the_line_from_the_untrained_agent_if_asked_for():
+    late = seed_curves("late", lambda seed, task, step: float(step), steps=(0, 150_000))
+    expected = {False: np.nan, True: 100_000}
+    for from_zero, mean in expected.items():
+        comparison = run(pd.concat([OURS, late]), budget=100_000, start=0, from_zero=from_zero)
+        assert cell(comparison.finals, "late", "walker-walk")["mean"] == pytest.approx(mean, nan_ok=True)
+
+
+def test_the_evaluation_of_the_untrained_agent_makes_no_evaluated_method():
+    late = seed_curves("late", ours, steps=(0, 300_000))
+    for budget, found in ((200_000, []), (300_000, ["late"])):
+        assert evaluated_methods(late, NO_MEANS, tasks=TASKS, budget=budget) == found
 
 
 def test_without_the_normaliser_there_are_returns_but_no_areas_and_a_note_says_so():

@@ -181,6 +181,9 @@ def test_a_run_that_repeats_actions_as_it_was_told_is_read(tmp_path):
 def test_one_env_step_is_one_decision_where_actions_are_not_repeated(tmp_path):
     run = make_run(tmp_path / "run", HEADER + "1000,1000,5,1.0,3.0,0.5,10\n", task="h1hand-walk")
     assert curve_of(read_run(run)) == [(1000.0, 3.0)]
+    run = make_run(tmp_path / "other", HEADER + "2000,1000,5,1.0,3.0,0.5,10\n", task="h1hand-walk")
+    with pytest.raises(ValueError, match="mixes units: 2000 env_steps beside 1000 decision_steps.* 1 env steps per d"):
+        read_run(run)
 
 
 def test_decision_steps_alone_are_an_error(tmp_path):

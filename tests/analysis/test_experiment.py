@@ -82,6 +82,13 @@ def test_unfinished_runs_and_those_that_end_early_are_named(tmp_path):
     assert len(lines) == 4
 
 
+def test_a_run_that_is_a_step_short_of_its_budget_is_whole_and_one_that_is_a_tenth_short_is_not(tmp_path):
+    root = plan(tmp_path, variants=["a"], seeds=[1, 2])
+    make_run(root, "a", 1), make_run(root, "a", 2)
+    for budget, short in ((101, 0), (111, 2)):
+        assert len(incomplete_runs(read(root), [read_experiment(plan(root, variants=["a"], budget=budget))])) == short
+
+
 def test_without_a_plan_a_seed_that_another_method_has_on_the_task_is_missed(tmp_path):
     for variant, seed in (("a", 1), ("a", 2), ("b", 1)):
         make_run(tmp_path, variant, seed)

@@ -87,12 +87,15 @@ def test_every_task_counts_alike_and_the_bootstrap_is_stratified():
     assert table.loc["All tasks", "pairs"] == 6
 
 
-def test_with_a_constant_for_every_task_the_row_over_tasks_is_normalised():
-    runs = pairs([(1.0, 0.0)] * 2) | pairs([(3.0, 0.0)] * 2, "y")
+def test_with_a_constant_for_every_task_the_differences_over_tasks_are_normalised_and_no_probability():
+    runs = pairs([(1.0, 0.0), (1.0, 2.0), (6.0, 0.0)]) | pairs([(4.0, 0.0), (1.0, 2.0)], "y")
     table = compare(curves(runs), constants=pd.Series({"x": 10.0, "y": 5.0}))
-    assert table.loc[AGGREGATE, "difference"] == pytest.approx((0.1 + 0.6) / 2)
-    assert table.loc["x", "difference"] == pytest.approx(1)
-    assert "All tasks" in compare(curves(runs), constants=pd.Series({"x": 10.0})).index
+    assert table.loc[AGGREGATE, "difference"] == pytest.approx((0.2 + 0.3) / 2)
+    assert table.loc["x", "difference"] == pytest.approx(2)
+    plain = compare(curves(runs), constants=pd.Series({"x": 10.0})).loc["All tasks"]
+    probabilities = ["improvement", "improvement_lower", "improvement_upper"]
+    assert table.loc[AGGREGATE, probabilities].tolist() == pytest.approx(plain[probabilities].tolist())
+    assert 0 < plain["improvement_lower"] < plain["improvement"] < plain["improvement_upper"]
 
 
 def test_one_pair_has_a_difference_and_no_interval():
@@ -114,6 +117,13 @@ def test_a_run_that_ends_before_the_step_or_has_not_begun_is_no_partner():
 def test_without_a_shared_run_there_is_no_row():
     assert compare(curves({("new", "x", 1): 1.0, ("base", "x", 2): 1.0})).empty
     assert compare(curves({}), variants=[]).empty
+
+
+def test_the_interval_is_that_of_95_percent_of_the_resamples():
+    differences = np.random.default_rng(0).normal(size=50)
+    row = compare(curves(pairs([(difference, 0.0) for difference in differences])), "x").loc["x"]
+    error = differences.std() / 50**0.5
+    assert (row["upper"] - row["lower"]) / (2 * error) == pytest.approx(1.96, rel=0.06)
 
 
 def test_the_interval_of_many_pairs_holds_the_truth_about_as_often_as_it_says():

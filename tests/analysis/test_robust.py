@@ -99,6 +99,21 @@ def test_more_runs_give_narrower_intervals():
     assert many.upper - many.lower < (few.upper - few.lower) / 2
 
 
+def test_the_interval_is_that_of_95_percent():
+    """Of many runs, the interval is the normal one of a trimmed mean, whose error is that of the winsorised scores."""
+    scores = draw(0, runs=400)["x"]
+    middle = np.sort(scores)[100:300]
+    error = np.clip(scores, middle[0], middle[-1]).std(ddof=1) / (0.5 * 400**0.5)
+    found = interquartile_mean({"x": scores}, resamples=4000)
+    assert (found.upper - found.lower) / (2 * error) == pytest.approx(1.96, rel=0.06)
+
+
+def test_both_methods_are_resampled_each_for_itself():
+    scores = {"x": [1.0, 2.0, 3.0, 4.0, 5.0]}
+    found = probability_of_improvement(scores, scores)  # if they were drawn as pairs, every resample would be a tie
+    assert found.lower < 0.25 and found.upper > 0.75
+
+
 def test_the_same_scores_give_the_same_interval_and_another_seed_nearly_the_same():
     assert interquartile_mean(draw(0)) == interquartile_mean(draw(0))
     one, other = (interquartile_mean(draw(0), seed=seed) for seed in (0, 1))

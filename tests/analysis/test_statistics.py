@@ -276,10 +276,11 @@ def test_another_method_can_normalise():
 
 
 def test_each_task_is_divided_by_its_own_constant_and_without_one_is_unavailable():
-    table = pd.concat([curve([0], 6.0, errors=1.0, task=task) for task in "xyz"], ignore_index=True)
+    table = pd.concat([curve([0], 6.0, errors=1.0, task=task).assign(std=3.0) for task in "xyz"], ignore_index=True)
     result = normalise(table, pd.Series({"x": 2.0, "y": 4.0}))
     np.testing.assert_allclose(result["mean"], [3.0, 1.5, np.nan])
     np.testing.assert_allclose(result["standard_error"], [0.5, 0.25, np.nan])
+    np.testing.assert_allclose(result["std"], [1.5, 0.75, np.nan])
     assert table["mean"].tolist() == [6.0, 6.0, 6.0]  # what was passed is unchanged
 
 
@@ -415,7 +416,8 @@ def test_seeds_on_unequal_grids_each_have_their_own_area():
     assert row.standard_error == pytest.approx(0.0)  # both areas are 1: a constant and the line 2 x - 2
 
 
-@pytest.mark.parametrize("seeds", [{1: {0: 1.0, 10: 2.0}}, {1: {0: 1.0, 10: 2.0}, 2: {0: 1.0, 9: 2.0}}])
-def test_one_seed_or_one_that_does_not_cover_the_grid_leaves_the_error_unknown(seeds):
+@pytest.mark.parametrize("ends", [(10,), (10, 9), (10, 9, 10)])
+def test_one_seed_or_one_that_does_not_cover_the_grid_leaves_the_error_unknown(ends):
+    seeds = {seed: {0: 1.0, end: seed + 2.0} for seed, end in enumerate(ends)}
     (row,) = auc_standard_error(seed_curves(seeds), np.array([0.0, 10.0])).itertuples()
     assert np.isnan(row.standard_error)

@@ -58,6 +58,20 @@ def test_the_mean_is_over_the_tasks_that_have_a_value_and_counts_them():
     assert found.loc[("between", MEAN, 50), "kind"] == "interpolated"
 
 
+def test_a_mean_is_interpolated_if_one_task_is_and_of_the_fewest_seeds():
+    estimates = pd.concat([curve("a", "x", {50: 1.0}, seeds=5), curve("a", "y", {40: 1.0, 60: 3.0}, seeds=2)])
+    found = returns_at(estimates, no_points(), steps=[50], tasks=TASKS, methods=["a"]).set_index("task")
+    assert found.loc[MEAN, ["kind", "seeds"]].tolist() == ["interpolated", 2]
+
+
+def test_where_a_method_has_a_curve_and_a_quote_the_curve_counts():
+    points = pd.concat([quote("a", "x", 50, 100.0), quote("between", "y", 50, 100.0), quote("late", "x", 50, 100.0)])
+    found = table(points)
+    assert found.index.is_unique
+    for method, mean, kind in (("a", 7, "evaluated"), ("between", 17.5, "interpolated"), ("late", 80, "quoted")):
+        assert found.loc[(method, MEAN, 50), ["mean", "kind", "tasks"]].tolist() == [mean, kind, 2]
+
+
 def test_quoted_points_stand_at_their_step_only_and_have_no_interval():
     found = table()
     assert found.loc[("paper", MEAN, 50), ["mean", "kind", "tasks"]].tolist() == [80, "quoted", 2]

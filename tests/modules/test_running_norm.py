@@ -47,6 +47,18 @@ def test_a_batch_that_is_not_finite_is_forgotten():
     assert torch.equal(norm.variance, before[1])
 
 
+def test_a_batch_of_which_nothing_counts_is_no_batch():
+    first, second = torch.randn(8, 2), torch.randn(8, 2) + 3
+    plain, padded = RunningNorm(2), RunningNorm(2)
+    for norm in (plain, padded):
+        norm.observe(first)
+    padded.observe(torch.zeros(8, 2), torch.zeros(8, dtype=torch.bool))
+    for norm in (plain, padded):
+        norm.observe(second)
+        assert norm.batches == 2
+    torch.testing.assert_close(padded.mean, plain.mean)
+
+
 def test_an_encoder_sees_a_small_entry_beside_a_large_one_only_if_it_standardises():
     """As in DMC's reacher: an angle of tens of radians beside the way to the target, a tenth of a metre."""
     observations = torch.randn(256, 2) * torch.tensor([30.0, 0.1])

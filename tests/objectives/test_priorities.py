@@ -96,11 +96,14 @@ def test_a_priority_is_the_mean_distance_of_a_slice_s_values_from_their_targets(
 
 def test_padding_has_no_part_in_a_priority(make_loss, world_model, slices, run_seeded):
     loss = make_loss("whole", world_model).eval()
-    weighted(slices)["collector", "mask"] = torch.arange(3) < torch.tensor([[3], [1], [2], [0]])
+    short = weighted(slices)[:, :1].clone()
+    slices["collector", "mask"] = torch.arange(3) < torch.tensor([[1], [3], [2], [0]])
     run_seeded(loss, slices)
     first = slices["td_error"].clone()
-    slices["observation"][1, 1:] = 30.0
-    slices["next", "observation"][1, 1:] = -30.0
+    run_seeded(loss, short)
+    torch.testing.assert_close(first[0, 0], short["td_error"][0, 0])  # of its one step, with the same noise
+    slices["observation"][0, 1:] = 30.0
+    slices["next", "observation"][0, 1:] = -30.0
     run_seeded(loss, slices)
     assert torch.equal(slices["td_error"], first)
     assert (first[3] == 0).all() and (first[:3] > 0).all()

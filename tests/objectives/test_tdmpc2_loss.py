@@ -309,6 +309,17 @@ def test_masked_steps_count_for_nothing(batch):
     torch.testing.assert_close(outs[1][1:], outs[0][1:])
 
 
+def test_the_running_scale_is_that_of_the_slices_that_count(batch):
+    loss = make_loss(make_model(dropout=0.0), scale_tau=1.0)
+    with torch.no_grad():
+        loss.world_model.value_head.output.weight.mul_(20)
+    evaluate(loss, batch)
+    assert loss.q_scale > 1.1
+    batch["collector", "mask"] = (torch.arange(B) == 2).unsqueeze(-1).expand(B, T).clone()
+    evaluate(loss, batch)
+    assert loss.q_scale == 1  # one value has no spread
+
+
 def test_a_prioritised_batch_gets_the_td_errors_of_its_slices(batch):
     loss = make_loss().eval()
     batch["priority_weight"] = torch.ones(B, T)

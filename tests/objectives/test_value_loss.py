@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc.objectives import LatentRollout, imagined_value_target, value_error
+from torchrl_etdmpc.objectives import LatentRollout, imagined_value_target, td_error, value_error
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -227,6 +227,18 @@ def test_the_term_is_its_error_times_its_coefficient_once(make_loss, slices):
     out = make_loss("value", rho=1.0, value_coef=7.0)(slices)
     torch.testing.assert_close(out["loss_value"].detach(), 7.0 * out["value_error"])
     assert make_loss("value", value_coef=0.0)(slices)["loss_value"] == 0
+
+
+def test_the_distance_from_a_target_is_the_mean_of_each_value_s_and_not_that_of_their_mean(make_world_model):
+    world_model = make_world_model()
+    predicted = torch.rand(3, 2, 7, 16)
+    predicted[0] = predicted[0, 0]  # all heads begin at the encoding
+    rollout = LatentRollout(torch.rand(3, 7, 16), predicted)
+    values = world_model.values(rollout.predicted[:-1])  # [T, F, B, V]
+    target = values.mean((1, 3))  # between the values
+    expected = (values - target[:, None, :, None]).abs().mean((1, 3))
+    assert expected.min() > 1e-3
+    torch.testing.assert_close(td_error(world_model, rollout, target), expected)
 
 
 @pytest.mark.parametrize("kind", ["value", "whole"])

@@ -394,6 +394,16 @@ def test_a_loaded_buffer_is_sampled_and_goes_on_as_the_saved_one(tmp_path, writt
     assert ring.every_drawn_slice() == valid  # the saved one has not changed with it
 
 
+def test_a_full_buffer_takes_the_state_of_one_whose_newest_row_stands_elsewhere():
+    saved, full = Ring(20, 3), Ring(20, 3)
+    for ring, written in ((saved, 33), (full, 27)):
+        ring.write(contiguous([50], written))
+        ring.draw(1)
+    for part in ("storage", "writer", "sampler"):
+        getattr(full.buffer, part).load_state_dict(getattr(saved.buffer, part).state_dict())
+    assert full.every_drawn_slice() == saved.every_drawn_slice() == saved.every_valid_slice()
+
+
 def test_a_snapshot_does_not_change_with_the_sampler():
     ring = Ring(30, 2)
     ring.write(contiguous([5], 12))
@@ -510,10 +520,10 @@ def _sizes_of_the_table(ring: Ring, rows: list[tuple[int, int]], chunk: int) -> 
     return sizes
 
 
-def test_the_table_of_trajectories_stays_bounded_after_thousands_of_evicted_ones():
-    ring = Ring(60, 3)
-    sizes = _sizes_of_the_table(ring, contiguous([3], 6300), 40)
-    assert max(sizes) < 150  # 21 trajectories fit into the ring
+@pytest.mark.parametrize("length", [3, 1])  # of every slice; with 1 the oldest row is a trajectory of its own
+def test_the_table_of_trajectories_stays_bounded_after_thousands_of_evicted_ones(length):
+    sizes = _sizes_of_the_table(Ring(60, length), contiguous([length], 2100 * length), 40)
+    assert max(sizes) < 150  # 60 / length trajectories fit into the ring
 
 
 def test_one_endless_trajectory_does_not_keep_the_table_from_shrinking():
@@ -701,10 +711,13 @@ def test_the_mask_may_have_another_key_and_a_partial_sample_always_has_it():
     assert buffer.sample(6)["valid"].tolist() == [True] * 6
 
 
-def test_partial_slices_know_the_ends_after_loading_and_after_the_ring_has_turned():
+@pytest.mark.parametrize("looked", [True, False], ids=["sampled-before", "not-sampled-before"])
+def test_partial_slices_know_the_ends_after_loading_and_after_the_ring_has_turned(looked):
     buffer = _buffer(3, partial=True)
     for begin in range(0, 120, 4):
         buffer.extend(_rows([begin] * 4, done=[3], t=torch.arange(begin, begin + 4)))
+    if looked:
+        buffer.sample(3)  # what was followed is in the state, and not read again
     state = buffer.state_dict()
     buffer.extend(_rows([200, 200], t=torch.arange(120, 122)))
     again = _buffer(3, partial=True)

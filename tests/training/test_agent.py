@@ -90,15 +90,16 @@ def test_every_setting_of_the_planner_arrives(tiny_config):
     assert planner.discount == 0.9
 
 
-def test_the_paper_s_planners_are_built_from_its_preset(tiny_config):
-    config = dataclasses.replace(preset("efficient-tdmpc-utd4"), compile="off", model=tiny_config().model)
+@pytest.mark.parametrize(("name", "beta"), [("efficient-tdmpc-utd4", 0.0), ("humanoidbench", 10.0)])
+def test_the_paper_s_planners_are_built_from_its_presets_and_reanalyze_alone_is_pessimistic(tiny_config, name, beta):
+    config = dataclasses.replace(preset(name), compile="off", model=tiny_config().model)
     agent = build_agent(config, OBSERVATION_DIM, ACTION_DIM)
     for planner in (agent.planner, agent.eval_planner):
         assert (planner.horizon, planner.num_samples, planner.num_elites, planner.num_proposals) == (6, 512, 64, 24)
         assert planner.score == MeanScore(beta=0.0)
     planner = agent.reanalyze_planner
     assert (planner.horizon, planner.num_samples, planner.num_elites, planner.num_proposals) == (3, 64, 8, 3)
-    assert planner.score == FinalScore(beta=0.0)
+    assert planner.score == FinalScore(beta=beta)
 
 
 def test_the_discount_follows_from_the_episode_s_length_unless_it_is_given(tiny_agent):

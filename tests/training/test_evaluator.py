@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.envs import StepCounter, Transform
 
 from torchrl_etdmpc.collectors import evaluate
+from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.training import Agent, EvaluationResult, Evaluator, build_agent
 
@@ -32,6 +33,12 @@ def make_evaluator(agent: Agent, *, env_seed: int | None = None, **options) -> E
         parallel=False,
     ).append_transform(StepCounter(12))
     return Evaluator(env, agent, **({"episodes": 3, "seed": 5} | options))
+
+
+def policy_return(evaluator: Evaluator, model: WorldModel) -> float:
+    """The mean return of a model's policy, without a planner, in the evaluator's episodes."""
+    evaluator.env.set_seed(5)
+    return evaluate(evaluator.env, BarePolicy(model), episodes=3).returns.mean().item()
 
 
 def test_two_evaluations_of_the_same_weights_are_equal_to_the_last_bit(agent):
@@ -102,10 +109,18 @@ def test_the_policy_without_the_planner_plays_the_same_episodes(agent):
     with_policy, without = make_evaluator(agent, with_policy=True)(), make_evaluator(agent)()
     assert with_policy[:3] == without[:3]
     assert without.policy_return is None
-    evaluator = make_evaluator(agent)
-    evaluator.env.set_seed(5)
-    expected = evaluate(evaluator.env, BarePolicy(agent.world_model), episodes=3).returns.mean().item()
+    expected = policy_return(make_evaluator(agent), agent.world_model)
     assert with_policy.policy_return == expected != with_policy.return_mean
+
+
+def test_the_policy_that_plays_alone_is_the_one_that_acts(tiny_config):
+    torch.manual_seed(0)
+    agent = build_agent(tiny_config(optim={"average_decay": 0.9}), 5, 1)
+    with torch.no_grad():  # what is trained goes on, its average stays
+        agent.world_model.policy.output.weight.add_(torch.randn_like(agent.world_model.policy.output.weight))
+    evaluator = make_evaluator(agent, with_policy=True)
+    acting, trained = (policy_return(evaluator, model) for model in (agent.acting_model, agent.world_model))
+    assert evaluator().policy_return == acting != trained
 
 
 def test_the_result_is_that_of_the_planner(agent):

@@ -20,6 +20,7 @@ from torchrl_etdmpc.collectors import NonFiniteError  # noqa: E402
 from torchrl_etdmpc.envs import make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     EvaluationResult,
+    Evaluator,
     TrainConfig,
     TrainingRun,
     build_agent,
@@ -142,11 +143,16 @@ def test_the_summary_states_the_run_and_its_result(finished, read_table):
     assert summary["final_return"] == evaluations[-1]
     assert summary["best_return"] == max(evaluations)
     assert summary["wall_time_s"] > 0
-    assert summary["decisions_per_second"] > 0
+    learned = 160 / 2 - finished.config.seed_decisions  # the task repeats actions twice
+    assert summary["decisions_per_second"] == pytest.approx(learned / finished.run.state.learning_s)
     assert summary["parameters"] == sum(p.numel() for p in finished.run.learner.agent.world_model.parameters())
     assert summary["device"] == "cpu"
     assert {"python", "torch", "torchrl", "tensordict"} <= set(summary["versions"])
     assert {name: summary[name] for name in finished.summary} == finished.summary
+
+
+def test_evaluations_play_other_episodes_than_training(finished):
+    assert finished.run.evaluator.seed == finished.config.seed + 10_000
 
 
 def test_the_checkpoint_is_the_agent_at_the_end(finished):
@@ -408,23 +414,21 @@ def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path, tiny_confi
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 160]
 
 
-def test_a_run_whose_last_evaluation_fails_has_no_final_return(tmp_path, tiny_config, make_run, read_table):
-    run = make_run(tiny_config(), tmp_path)
-    play, calls = run.evaluator.env.step_and_maybe_reset, []
-
-    def break_at_the_end(tensordict: TensorDictBase):
-        calls.append(1)
-        if len(calls) > 2 * EPISODE:
+def test_a_run_whose_last_evaluation_fails_has_a_best_return_and_no_final_one(
+    tmp_path, tiny_config, make_run, monkeypatch
+):
+    def tell(evaluator: Evaluator, on_step: object = None) -> EvaluationResult:
+        if not told:
             raise RuntimeError("no more of it")
-        return play(tensordict)
+        return EvaluationResult(return_mean=told.pop(), return_std=1.0, episodes=1)
 
-    run.evaluator.env.step_and_maybe_reset = break_at_the_end
-    with pytest.warns(UserWarning, match=r"^the evaluation at 160 env steps failed"):
+    told = [20.0, 90.0]  # the untrained agent is the best
+    monkeypatch.setattr(Evaluator, "__call__", tell)
+    run = make_run(tiny_config(), tmp_path)
+    with pytest.warns(UserWarning, match=r"^the evaluation at 160 env steps failed \(no more of it\)"):
         summary = run.run()
-    evaluations = [row["return_mean"] for row in read_table(tmp_path / "eval.csv")]
-    assert len(evaluations) == 2
+    assert summary["best_return"] == 90
     assert math.isnan(summary["final_return"])
-    assert summary["best_return"] == max(evaluations)
     assert json.loads((tmp_path / "summary.json").read_text())["final_return"] is None
 
 

@@ -606,6 +606,17 @@ def test_an_update_without_a_finite_gradient_changes_nothing_but_the_count(poiso
     assert not any(map(torch.equal, weights[:1], updater.loss.world_model.parameters()))
 
 
+def test_skipped_updates_are_counted_on_from_a_saved_state():
+    updater, restored, batch = make_updater(), make_updater(), make_batch()
+    batch["next", "reward"][0] = torch.nan
+    for _ in range(3):
+        updater.step(batch)
+    restored.load_state_dict(updater.state_dict())
+    for skipped in (3, 4):
+        assert (int(restored.skipped), int(restored.skipped_in_a_row)) == (skipped, skipped)
+        restored.step(batch)
+
+
 def test_a_policy_gradient_that_is_not_finite_stops_the_policy_alone():
     world_model, batch = make_world_model(), make_batch()
     updater, usual = make_updater(world_model), make_updater(copy.deepcopy(world_model))

@@ -41,7 +41,8 @@ def returns_at(
 
     Args:
         estimates (DataFrame): of curves.
-        points (DataFrame): quoted means ``method, task, env_steps, mean, source``; they count at their own step only.
+        points (DataFrame): quoted means ``method, task, env_steps, mean, source``; they count at their own step only,
+            and where the method has a curve's value on the task at that step, the quote is left out.
         steps (sequence of float): env steps.
         tasks (sequence of str): the compared tasks.
         methods (sequence of str): of the curves; those of the points come behind them.
@@ -69,6 +70,8 @@ def returns_at(
     here = zip(curves["method"], curves["task"], curves["env_steps"], strict=True)
     curves = curves.assign(kind=["evaluated" if cell in there else "interpolated" for cell in here])
     quoted = points[points["task"].isin(tasks) & points["env_steps"].isin(grid)]
+    known, cells = (part.set_index(["method", "task", "env_steps"]).index for part in (curves, quoted))
+    quoted = quoted[~cells.isin(known)]
     quoted = quoted.drop(columns="source").assign(standard_error=np.nan, seeds=np.nan, kind="quoted")
     table = pd.concat([part for part in (curves, quoted) if len(part)] or [curves], ignore_index=True).assign(tasks=1)
     table = table.sort_values("env_steps", kind="stable", ignore_index=True)
