@@ -8,13 +8,14 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, SerialEnv
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
+from torchrl_etdmpc.envs.layers import simulator_of
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
 from torchrl_etdmpc.runs.files import make_folder_of, write_whole
@@ -116,9 +117,8 @@ def main(config: EvaluateConfig) -> None:
 
 def _first(env: EnvBase) -> EnvBase:
     """The first of environments that run side by side, or the only one."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env._envs[0] if isinstance(env, SerialEnv) else env
+    simulator = simulator_of(env)
+    return simulator._envs[0] if isinstance(simulator, SerialEnv) else simulator
 
 
 def _table(task: Task, played: Episodes) -> str:

@@ -13,8 +13,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.parameter import UninitializedBuffer
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
+
+from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
 
 __all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
 
@@ -172,7 +174,7 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
     >>> load_simulator_state(make_env("gym/Pendulum-v1", seed=0), state)
     True
     """
-    simulator = _simulator(env)
+    simulator = simulator_of(env)
     if isinstance(simulator, BatchedEnvBase):
         # Workers with transforms have none, and must not be asked: before its first step, TorchRL's ActionScaling
         # cannot tell its state, and a worker process that fails to is lost.
@@ -205,34 +207,18 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
     """
     if state is None:
         return False
-    simulator = _simulator(env)
+    simulator = simulator_of(env)
     simulator.load_state_dict({name: part for name, part in state.items() if name != _TRANSFORMS})
-    try:
-        _load_transform_states(env, state.get(_TRANSFORMS, {}))
-    except (RuntimeError, LookupError):  # made in another way than the one that was saved
-        return False
     # TorchRL 0.14: a ParallelEnv's workers report that they are done twice, and the next step would not wait for them.
     flags = simulator.__dict__.get("_shm_done_flags")
     if flags is not None:
         for worker in range(len(flags)):
             flags[worker] = 0
+    try:
+        _load_transform_states(env, state.get(_TRANSFORMS, {}))
+    except (RuntimeError, LookupError):  # made in another way than the one that was saved
+        return False
     return _equal(simulator_state(env), state)
-
-
-def _simulator(env: EnvBase) -> EnvBase:
-    """The environment below all transforms."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
-
-
-def transforms_of(env: EnvBase) -> list[Transform]:
-    """Every transform above the simulator, the outermost environment's first."""
-    found: list[Transform] = []
-    while isinstance(env, TransformedEnv):
-        found += env.transform if isinstance(env.transform, Compose) else [env.transform]
-        env = env.base_env
-    return found
 
 
 def _transform_states(env: EnvBase) -> dict[str, Any]:

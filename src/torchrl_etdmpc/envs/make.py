@@ -12,9 +12,9 @@ from torchrl.envs.transforms import VecNormV2
 
 from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.dmc import dmc_maker
-from torchrl_etdmpc.envs.episode import transforms_of
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
 from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_maker
+from torchrl_etdmpc.envs.layers import transforms_of
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
 from torchrl_etdmpc.envs.worker import make_in_worker, start_workers
 

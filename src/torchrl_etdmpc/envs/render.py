@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.envs import DMControlEnv, EnvBase, GymWrapper, TransformedEnv
+from torchrl.envs import DMControlEnv, EnvBase, GymWrapper
 
 from torchrl_etdmpc.envs.humanoid_bench import RecordedHumanoidBenchEnv
+from torchrl_etdmpc.envs.layers import simulator_of
 from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM
 
 __all__ = ["render_frame"]
@@ -51,9 +52,7 @@ def render_frame(
     >>> frame.shape  # doctest: +SKIP
     torch.Size([240, 320, 3])
     """
-    base = env
-    while isinstance(base, TransformedEnv):
-        base = base.base_env
+    base = simulator_of(env)
     if isinstance(base, DMControlEnv):
         return _dm_control_frame(base, *_size(height, width, (_DMC_SIZE, _DMC_SIZE)), camera_id)
     if not isinstance(base, GymWrapper):

@@ -6,13 +6,14 @@ import dataclasses
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter, Transform, TransformedEnv
+from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter
 
+from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
 from torchrl_etdmpc.envs.make import find_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
 
@@ -143,7 +144,7 @@ def _require_agreement(task: Task, env: EnvBase) -> None:
             f"episode_length of task {task.name!r} must be at most {limit}, its environment's own limit, got "
             f"{task.episode_length}."
         )
-    if task.terminates and any(isinstance(layer, FrameSkipTransform) for layer in _layers(env)):
+    if task.terminates and any(isinstance(transform, FrameSkipTransform) for transform in transforms_of(env)):
         raise ValueError(
             f"task {task.name!r} repeats actions with FrameSkipTransform, which steps on where an episode has ended; "
             "repeat them with frame_skip= of GymEnv or DMControlEnv, or in a step of your own, or say that only the "
@@ -165,7 +166,7 @@ def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
 def _action_repeat(env: EnvBase) -> int:
     """Env steps per step of this environment, as far as its layers tell."""
     repeat = 1
-    for layer in _layers(env):
+    for layer in [*transforms_of(env), simulator_of(env)]:
         # Of an environment that cannot repeat actions itself, TorchRL keeps the number and appends the transform.
         if isinstance(layer, FrameSkipTransform) or getattr(type(layer), "_has_frame_skip", False):
             repeat *= layer.frame_skip
@@ -174,19 +175,9 @@ def _action_repeat(env: EnvBase) -> int:
 
 def _limit(env: EnvBase) -> int | None:
     """The time limit of this environment in env steps, the least that its layers tell."""
-    limits = []
-    for layer in _layers(env):
-        if isinstance(layer, StepCounter) and layer.max_steps is not None:
-            limits.append(layer.max_steps * _action_repeat(env))
-        elif not isinstance(layer, Transform):
-            spec = getattr(getattr(layer, "_env", None), "spec", None)
-            limits.append(getattr(spec, "max_episode_steps", None))
+    spec = getattr(getattr(simulator_of(env), "_env", None), "spec", None)
+    limits = [getattr(spec, "max_episode_steps", None)]
+    for transform in transforms_of(env):
+        if isinstance(transform, StepCounter) and transform.max_steps is not None:
+            limits.append(transform.max_steps * _action_repeat(env))
     return min((limit for limit in limits if limit is not None), default=None)
-
-
-def _layers(env: EnvBase) -> Iterator[EnvBase | Transform]:
-    """The environment below all transforms, and each transform."""
-    while isinstance(env, TransformedEnv):
-        yield from (layer for layer in env.transform.modules() if isinstance(layer, Transform))
-        env = env.base_env
-    yield env

@@ -13,7 +13,9 @@ from multiprocessing import resource_tracker
 from typing import Any, TextIO
 
 import torch
-from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv
+
+from torchrl_etdmpc.envs.layers import simulator_of
 
 # How long a worker process may take for a step, in seconds.
 _PATIENCE_S = 300
@@ -70,8 +72,7 @@ def start_workers_anew(env: EnvBase) -> bool:
     Returns:
         bool: whether it steps in processes of its own.
     """
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
+    env = simulator_of(env)
     if not isinstance(env, ParallelEnv) or env.is_closed or not env._owns_workers:
         return False
     for process in env._workers:
