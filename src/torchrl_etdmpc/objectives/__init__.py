@@ -2,10 +2,11 @@
 
 from torchrl_etdmpc.objectives.action_value import action_td_error, action_value_error, action_value_target
 from torchrl_etdmpc.objectives.efficient_tdmpc import EfficientTDMPCLoss
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, latent_rollout
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, latent_rollout
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
 from torchrl_etdmpc.objectives.max_q import PolicyValue, policy_value
 from torchrl_etdmpc.objectives.policy import EfficientTDMPCPolicyLoss, KLDirection, distillation
+from torchrl_etdmpc.objectives.slices import Slices
 from torchrl_etdmpc.objectives.tdmpc2 import TDMPC2Loss
 from torchrl_etdmpc.objectives.terms import Term, TermFunction
 from torchrl_etdmpc.objectives.value import (

@@ -1,48 +1,15 @@
-"""Replayed slices and their latent rollout, which all terms of a loss share."""
+"""The latent rollout of replayed slices, which all terms of a loss share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_etdmpc.modules import WorldModel
-
-
-class Slices(NamedTuple):
-    """Replayed slices, time first. Fields that a loss does not read are ``None``.
-
-    >>> Slices(torch.zeros(4, 3), torch.zeros(2, 4, 3), torch.zeros(2, 4, 1), None, None, None, None).action.shape
-    torch.Size([2, 4, 1])
-    """
-
-    observation: Any
-    """First observation of each slice, ``[B, O]``, or what the encoder takes: a tensor ``[B, ...]`` or a ``TensorDict``
-    with the batch size [B]."""
-    next_observation: Any
-    """``[T, B, O]``, or likewise."""
-    action: Tensor
-    """``[T, B, A]``"""
-    reward: Tensor | None
-    """``[T, B]``"""
-    terminated: Tensor | None
-    """``[T, B]`` bool; entry k says whether step k *reached* a terminal state."""
-    plan_loc: Tensor | None
-    """``[T, B, A]``"""
-    plan_scale: Tensor | None
-    """``[T, B, A]``"""
-    counts: Tensor | None = None
-    """``[T, B]`` bool: the steps that count; the content of the others has been replaced by harmless values. ``None``:
-    all of them count."""
-    weights: Tensor | None = None
-    """``[T, B]``: how much each step counts in the losses, from a prioritised sampler. ``None``: all the same."""
-    prioritised: bool = False
-    """Whether the batch is a prioritised sampler's, and terms offer new priorities."""
-    extra: Mapping[NestedKey, Tensor] | None = None
-    """What else the terms read, by its key, ``[T, B, ...]``."""
+from torchrl_etdmpc.objectives.slices import Slices
 
 
 class LatentRollout(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
@@ -14,19 +14,17 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from torchrl_etdmpc.keys import ACTION, DONE, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
+from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.modules.new_weights import draw_new_weights
-from torchrl_etdmpc.objectives.latent_rollout import Slices, counted_mean, latent_rollout
+from torchrl_etdmpc.objectives.latent_rollout import counted_mean, latent_rollout
+from torchrl_etdmpc.objectives.slices import FIELDS, OBSERVATION_FIELDS, SliceReader, Slices
 from torchrl_etdmpc.objectives.terms import PRIORITY, KLDirection, Term, check_terms
 from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
 
 Reduction = Literal["none", "mean", "sum"]
 """What a loss makes of the errors of its steps."""
 
-_FEATURES = ("action", "reward", "terminated", "plan_loc", "plan_scale")
-_OBSERVATIONS = ("observation", "next_observation")
-_FIELDS = (*_OBSERVATIONS, *_FEATURES)
 _REDUCTIONS = get_args(Reduction)
 
 
@@ -349,11 +347,13 @@ class LatentRolloutLoss(LossModule):
 
     def _reads(self) -> dict[NestedKey, NestedKey]:
         """Where each field of the slices is read, and each further key of the terms."""
-        names = dict.fromkeys([*_OBSERVATIONS, "action", *(key for term in self.active_terms for key in term.keys)])
+        names = dict.fromkeys(
+            [*OBSERVATION_FIELDS, "action", *(key for term in self.active_terms for key in term.keys)]
+        )
         return {name: self._key(name) for name in names}
 
     def _key(self, name: NestedKey) -> NestedKey:
-        if name not in _FIELDS:
+        if name not in FIELDS:
             return unravel_key(name)
         key = getattr(self.tensor_keys, name.removeprefix("next_"))
         return unravel_key((NEXT, key)) if name in ("next_observation", "reward", "terminated") else unravel_key(key)
@@ -389,85 +389,25 @@ class LatentRolloutLoss(LossModule):
 
         Raises:
             ValueError: if the batch is empty, an entry is not of shape [B, T, features] (one that the encoder owns:
-                [B, T, ...]), or
-                a row of a CPU tensor terminates although the world model has no termination head. Elsewhere that
-                check would wait for the device, and under ``torch.compile`` it cannot be made: it is skipped.
+                [B, T, ...]), or of another size or dtype than the networks need, or steps of a slice do not follow each
+                other; without ``ignore_termination`` also if a row terminates although the world model has no
+                termination head. The last two look at values: they are made on a CPU only, where they do not wait for
+                the device, and not under ``torch.compile``.
             KeyError: if a key is missing.
             RuntimeError: if the world model's weights are no longer those that this loss trains, or its targets are
                 elsewhere.
         """
         self._refuse_other_weights()
-        reads = self._reads()
-        entries: dict[NestedKey, Any] = {name: self._entry(tensordict, name, key) for name, key in reads.items()}
-        for name, entry in entries.items():
-            if entry.shape[:2] != entries["action"].shape[:2]:  # it would be spread over the batch, or fail elsewhere
-                raise self._shape_error(reads[name], entry)
-        if 0 in entries["action"].shape[:2]:
-            raise ValueError(
-                f"{type(self).__name__} needs at least one step, got {list(tensordict.batch_size)} slices."
-            )
-        counts = self._counted_steps(tensordict, entries["action"].shape[:2])
-        self._refuse_termination(tensordict, counts)
-        self._refuse_gaps(tensordict, counts, entries["action"].shape[:2])
-        for name, entry in entries.items():
-            if counts is not None:
-                # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
-                entry = _where(counts, entry, torch.ones_like if name == "plan_scale" else torch.zeros_like)
-            entries[name] = entry.transpose(0, 1)
-        fields: dict[str, Any] = {name: entries.pop(name, None) for name in _FIELDS}
-        fields["observation"] = fields["observation"][0]
-        for name in ("reward", "terminated"):
-            if fields[name] is not None:
-                fields[name] = fields[name].squeeze(-1)
-        if fields["terminated"] is not None:
-            fields["terminated"] = fields["terminated"].bool()
-        counts = None if counts is None else counts.transpose(0, 1)
-        weights = tensordict.get(self.tensor_keys.priority_weight, None)
-        prioritised = weights is not None
-        if not self.use_prioritized_weights:
-            weights = None
-        if weights is not None:
-            # One weight per slice: that of its first row, which the sampler drew.
-            steps, slices = fields["action"].shape[:2]
-            weights = weights.reshape(slices, steps)[:, 0].expand(steps, slices).to(fields["action"].dtype)
-        return Slices(**fields, counts=counts, weights=weights, prioritised=prioritised, extra=entries or None)
-
-    def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor | TensorDictBase:
-        value = tensordict.get(key, None)
-        if value is None:
-            rename = f"loss.set_keys({name.removeprefix('next_')}=...)" if name in _FIELDS else "Term(keys=...)"
-            raise KeyError(
-                f"{type(self).__name__} needs the key {key!r} in its input; rename it with {rename} or store it in the "
-                "replay buffer."
-            )
-        # The batch size is no guide: dispatch infers a longer one where all entries agree in size.
-        vector = name in _FEATURES or (name in _OBSERVATIONS and self.world_model.observation_dim is not None)
-        if value.ndim != 3 if vector else value.ndim < 2:
-            raise self._shape_error(key, value)
-        if vector:
-            self._check_features(name, key, value)
-        return value
-
-    def _check_features(self, name: NestedKey, key: NestedKey, value: Any) -> None:
-        """A last dimension of 1 would be spread over an action, and another size fail where no key is known."""
-        model = self.world_model
-        size = model.observation_dim if name in _OBSERVATIONS else 1 if name in ("reward", "terminated") else None
-        size = model.action_dim if size is None else size
-        if value.shape[-1] != size:
-            raise ValueError(
-                f"{type(self).__name__} needs {size} features in the last dimension of {key!r}, got {value.shape[-1]} "
-                f"(shape {list(value.shape)}); store the entry so, or build the world model for it."
-            )
-        if name == "action" and not value.is_floating_point():
-            raise ValueError(
-                f"{type(self).__name__} needs continuous actions in [-1, 1], got {key!r} of {value.dtype}; discrete "
-                "actions have no Gaussian policy."
-            )
-        if name in ("action", *_OBSERVATIONS) and value.dtype == torch.float64 != model.bins.dtype:
-            raise ValueError(
-                f"{type(self).__name__} needs {key!r} in {model.bins.dtype}, as the weights are, got {value.dtype}; "
-                "append DoubleToFloat() to the environment, or convert the batch."
-            )
+        refused = not self.ignore_termination and self.world_model.termination_head is None
+        reader = SliceReader(
+            type(self).__name__,
+            self.world_model,
+            mask_keys=self._loss_mask_keys(),
+            weight_key=self.tensor_keys.priority_weight,
+            use_weights=bool(self.use_prioritized_weights),  # or "auto": where there are some
+            terminated_key=self._key("terminated") if refused else None,
+        )
+        return reader.read(tensordict, self._reads())
 
     def _refuse_other_weights(self) -> None:
         if torch.compiler.is_compiling():
@@ -499,68 +439,11 @@ class LatentRolloutLoss(LossModule):
                     "loss.to(...)."
                 )
 
-    def _shape_error(self, key: NestedKey, value: Tensor | TensorDictBase) -> ValueError:
-        return ValueError(
-            f"{type(self).__name__} needs a batch of slices [B, T] and entries of shape [B, T, features], got "
-            f"{key!r} of shape {list(value.shape)}; reshape a flat replay sample with sample.reshape(-1, slice_len)."
-        )
-
     def write_priority(self, tensordict: TensorDictBase, evaluated: dict[str, Tensor]) -> None:
         """Moves the priorities of a batch, if there are some, from what :meth:`evaluate` returned into the batch."""
         priority = evaluated.pop(PRIORITY, None)
         if priority is not None:
             tensordict.set(self.tensor_keys.priority, priority)
-
-    def _counted_steps(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
-        """The steps up to which nothing in their slice is masked, bool ``[B, T]``; ``None`` without a mask."""
-        counts = None
-        for key in self._loss_mask_keys():
-            mask = tensordict.get(key, None)
-            if mask is None:
-                continue
-            if mask.numel() != shape.numel() or mask.shape[:2] != shape:
-                raise ValueError(
-                    f"the mask {key!r} must have the shape [B, T]={list(shape)}, got {list(mask.shape)}; set "
-                    "loss.loss_mask_key to the key of another mask, or to None for no mask."
-                )
-            mask = mask.reshape(shape).bool()
-            counts = mask if counts is None else counts & mask
-        return None if counts is None else counts.int().cumprod(1) > 0
-
-    def _refuse_termination(self, tensordict: TensorDictBase, counts: Tensor | None) -> None:
-        if self.ignore_termination or self.world_model.termination_head is not None or torch.compiler.is_compiling():
-            return
-        terminated = tensordict.get(self._key("terminated"), None)
-        if terminated is None or terminated.device.type != "cpu":
-            return
-        if counts is not None:
-            terminated = terminated.squeeze(-1).bool() & counts
-        if terminated.any():
-            raise ValueError(
-                f"{self._key('terminated')!r} holds True, but the world model has no termination head, so values would "
-                "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
-                f"{type(self).__name__}(..., ignore_termination=True) if that is what you want."
-            )
-
-    def _refuse_gaps(self, tensordict: TensorDictBase, counts: Tensor | None, shape: torch.Size) -> None:
-        """Steps must follow each other, one at a time: what n-step returns and episodes side by side do not."""
-        if torch.compiler.is_compiling():
-            return
-        done, steps = tensordict.get((NEXT, DONE), None), tensordict.get("steps_to_next_obs", None)
-        if steps is not None and steps.device.type == "cpu" and (steps != 1).any():
-            raise ValueError(
-                "'steps_to_next_obs' is not 1 everywhere: these losses learn single steps, and n-step rewards and "
-                "observations would be taken for those of one; leave MultiStep out, value_replayed=... has n-step "
-                "targets."
-            )
-        if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
-            return
-        inside = done.reshape(shape)[:, :-1].bool()
-        if (inside if counts is None else inside & counts[:, 1:]).any():
-            raise ValueError(
-                f"{(NEXT, DONE)!r} is True before the last step of a slice, so that another episode follows in it; "
-                "sample slices of one episode each (StepSliceSampler), or mask what follows (loss_mask_key)."
-            )
 
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -660,10 +543,3 @@ class LatentRolloutLoss(LossModule):
 
 def _first(params: Any) -> Tensor:
     return next(iter(params.values(True, True)))
-
-
-def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:
-    """The entry ``[B, T, ...]``, or each of a dictionary, where the step counts, and harmless values elsewhere."""
-    if isinstance(entry, TensorDictBase):
-        return entry.apply(lambda value: _where(counts, value, harmless))
-    return torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))

@@ -12,8 +12,9 @@ from torch.func import functional_call
 from torchrl_etdmpc.functional import gaussian_entropy, tanh_log_slope, two_hot_decode, updated_scale
 from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives.action_value import draw_two_heads
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss
+from torchrl_etdmpc.objectives.slices import Slices
 from torchrl_etdmpc.objectives.terms import Term, require_not_negative
 
 

@@ -12,12 +12,12 @@ from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_sca
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import (
     LatentRollout,
-    Slices,
     counted_mean,
     head_rows,
     mean_of_head_rows,
 )
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
+from torchrl_etdmpc.objectives.slices import Slices
 from torchrl_etdmpc.objectives.terms import KLDirection, Term, require_not_negative
 
 _DIRECTIONS = get_args(KLDirection)

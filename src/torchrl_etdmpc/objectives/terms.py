@@ -10,7 +10,8 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout
+from torchrl_etdmpc.objectives.slices import Slices
 
 KLDirection = Literal["backward", "forward"]
 """``"backward"`` is ``KL(pi || plan)``, ``"forward"`` is ``KL(plan || pi)``."""

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from torchrl_etdmpc.functional import two_hot_cross_entropy
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, Slices, head_rows, mean_of_head_rows
+from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
+from torchrl_etdmpc.objectives.slices import Slices
 from torchrl_etdmpc.objectives.terms import Term, require_not_negative
 
 
