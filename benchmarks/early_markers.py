@@ -10,6 +10,7 @@ lowest, median and highest of each marker over all runs. Without arguments it wr
 
 from __future__ import annotations
 
+import argparse
 import csv
 import io
 import sys
@@ -69,9 +70,14 @@ def ranges(folders: dict[str, Path]) -> str:
     return memory.getvalue()
 
 
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Writes the committed runs' table, or prints that of the folders that are named."""
-    own = {name: Path(folder) for name, _, folder in (argument.partition("=") for argument in arguments)}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("runs", nargs="*", metavar="NAME=FOLDER", help="a name and a folder with run directories below")
+    arguments = parser.parse_args().runs
+    own = {name: Path(folder) for name, _, folder in (argument.partition("=") for argument in arguments) if folder}
+    if len(own) < len(arguments):
+        parser.error(f"every argument must be NAME=FOLDER with a name of its own, got {' '.join(arguments)}")
     try:
         text = ranges(own or COMMITTED)
     except ValueError as error:
@@ -84,4 +90,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

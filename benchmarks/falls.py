@@ -9,6 +9,7 @@ episodes, which overstates it where both evaluations play the same starts. Write
 
 from __future__ import annotations
 
+import argparse
 import math
 
 import pandas as pd
@@ -42,6 +43,7 @@ def largest_fall(curve: pd.DataFrame) -> dict[str, float]:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter).parse_args()
     rows = []
     presets = (
         (64, 101, "imagined", RESULTS / "width-64"),

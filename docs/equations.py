@@ -118,8 +118,8 @@ EQUATIONS = (
     ),
     Equation(
         "thesis 3.2, TD-MPC2",
-        "the fit of MPPI to its elites",
-        r"\mu = \sum_k w_k a_k, \; w = \mathrm{softmax}(\tau s)",
+        "the fit of MPPI to its elites; $\\lambda$ is the inverse temperature",
+        r"\mu = \sum_k w_k a_k, \; w = \mathrm{softmax}(\lambda s)",
         f"{_FUNCTIONAL}.fit_gaussian",
         (
             "tests/functional/test_mppi.py::test_fit_gaussian_is_the_weighted_mean_and_standard_deviation",
@@ -155,7 +155,7 @@ EQUATIONS = (
         ("tests/functional/test_two_hot.py::test_the_gradient_of_the_cross_entropy_is_softmax_minus_target",),
     ),
     Equation(
-        "thesis 2.3",
+        "TD-MPC2, thesis Table A.1",
         "the discount that episodes of $E$ decisions suggest",
         r"\mathrm{clip}\left(\frac{E/5 - 1}{E/5}, 0.95, 0.995\right)",
         f"{_FUNCTIONAL}.discount_from_episode_length",

@@ -29,6 +29,27 @@ class Counter:
         self.number, self.history = state_dict["number"], list(state_dict["history"])
 
 
+@pytest.mark.parametrize("key", ["plan", ("target", "mine")])
+def test_targets_that_were_made_anew_come_back_wherever_they_are(tmp_path, key):
+    def make() -> TensorDictReplayBuffer:
+        writer = TensorDictRoundRobinWriter(track_generations=True)
+        return TensorDictReplayBuffer(storage=LazyTensorStorage(30), writer=writer, batch_size=4)
+
+    def target(value: float) -> TensorDict:
+        fields = {name: torch.full((5, 1), value) for name in ("loc", "scale", "value")}
+        return TensorDict(fields | {"version": torch.full((5, 1), int(value))}, [5])
+
+    buffer, store = make(), CheckpointStore(tmp_path, plan_key=key)
+    buffer.extend(TensorDict({"x": torch.randn(5, 3)}, [5]).set(key, target(0)))
+    store.save(1, {}, buffer)
+    rows = buffer.storage[:].clone().set(key, target(3))
+    buffer.storage.set(torch.arange(5), rows, set_cursor=False)
+    store.save(2, {}, buffer, version=3)
+    other = make()
+    CheckpointStore(tmp_path, plan_key=key).load({}, other)
+    assert (other.storage[:] == buffer.storage[:]).all()
+
+
 class Work:
     """Two parts and a buffer that change, as a run does."""
 

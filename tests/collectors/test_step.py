@@ -600,10 +600,11 @@ def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
     rows = len(replay)
     resumed = StepCollector(make_env((3, 5)), RandomActions(), seed_policy=RandomActions(), **options)
     resumed.step()  # forgotten by loading
-    replay_rows = len(replay)
     state = first.state_dict()
     with pytest.warns(UserWarning, match=r"^the environment cannot be restored, so fresh episodes begin\.$"):
         resumed.load_state_dict(state)
+    replay_rows = len(replay)
+    assert resumed.begins_fresh
     assert (resumed.frames, resumed.in_seed_phase) == (14, True)
     assert resumed.state_dict()["next_trajectory"] == state["next_trajectory"]
     resumed.seed_policy.calls = 0
@@ -615,6 +616,77 @@ def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
     assert min(fresh[TRAJ_KEY].tolist()) > max(used)
     for row in (steps[0] for steps in episodes(fresh).values()):
         assert row["observation"][1] == 0
+
+
+@pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+def test_episodes_that_cannot_go_on_are_stored_to_their_last_step_as_truncated_ones(insertion, lengths):
+    replay = make_replay(sampler=StepSliceSampler(3, partial=True), batch_size=3)
+    options = {"replay_buffer": replay, "insertion": insertion}
+    first, second = (StepCollector(make_env(lengths), RandomActions(), **options) for _ in range(2))
+    for _ in range(5):
+        first.step()
+    state = first.state_dict()
+    with pytest.warns(UserWarning, match="the environment cannot be restored"):
+        second.load_state_dict(state)
+    rows = episodes(replay.storage[:])
+    assert [[row["next", "truncated"].item() for row in steps] for steps in rows.values()] == [
+        [False] * 4 + [True] for _ in lengths
+    ]
+    second.step()
+    assert min(second.state_dict()["carrier"]["collector"]["traj_ids"].reshape(-1).tolist()) > max(rows)
+
+
+@pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])
+@pytest.mark.parametrize("faults", [1, 2], ids=["before-saving", "before-and-after"])
+def test_ends_that_faults_made_are_made_again_in_a_buffer_that_was_saved_before(lengths, faults, monkeypatch):
+    # What was written is never written again by a checkpoint, so the rows come back as they first were.
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.load_simulator_state", lambda *_: True)
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: {})
+
+    def make() -> StepCollector:
+        sampler = StepSliceSampler(3, partial=True)
+        return StepCollector(make_env(lengths), RandomActions(), replay_buffer=make_replay(sampler=sampler))
+
+    first, second = make(), make()
+    buffer = first.replay_buffer
+    for _ in range(5):
+        first.step()
+    before = buffer.storage[:].clone()
+    first._truncate_episodes()  # as a fault does
+    for _ in range(3):
+        first.step()
+    buffer.sampler.sample(buffer.storage, 3)
+    other = second.replay_buffer
+    other.extend(torch.cat([before, buffer.storage[:][len(before) :]]))
+    other.sampler.load_state_dict(buffer.sampler.state_dict())
+    second.load_state_dict(first.state_dict())
+    assert not second.begins_fresh
+    if faults == 2:
+        for collector in (first, second):
+            collector._truncate_episodes()
+    done = other.storage[:]["next", "done"].reshape(-1, len(lengths)).all(-1).tolist()
+    assert done == [False] * 4 + [True] + [False] * 2 + [faults == 2]
+    assert (other.storage[:] == buffer.storage[:]).all()
+    torch.manual_seed(0)
+    rows, _ = buffer.sampler.sample(buffer.storage, 300)
+    torch.manual_seed(0)
+    assert torch.equal(other.sampler.sample(other.storage, 300)[0], rows)
+
+
+def test_a_row_that_was_written_over_is_not_ended_by_the_fault_of_an_older_episode(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.load_simulator_state", lambda *_: True)
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: {})
+    buffer = make_replay(4)
+    first, second = (StepCollector(make_env((9,)), RandomActions(), replay_buffer=buffer) for _ in range(2))
+    for _ in range(3):
+        first.step()
+    first._truncate_episodes()
+    for _ in range(4):
+        first.step()
+    assert not buffer.storage[:]["next", "done"].any()
+    second.load_state_dict(first.state_dict())
+    assert not buffer.storage[:]["next", "done"].any()
 
 
 def test_what_a_seed_policy_holds_is_saved_with_the_seed_phase_and_not_after_it():

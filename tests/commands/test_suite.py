@@ -106,6 +106,17 @@ def test_seeds_are_how_many_or_which(call, mine, asked, seeds):
     assert [int(word.removeprefix("seed=")) for line in planned for word in line.split() if "seed=" in word] == seeds
 
 
+def test_a_default_that_is_none_can_be_typed_as_the_help_prints_it(call, mine):
+    experiment = f"experiment={mine()}"
+    message, expected = call(experiment, "dry_run=true")
+    assert message is None
+    nothing = ("runs_dir=null", "tasks=null", "seeds=null", "variants=null", "workers=null", "address=null")
+    assert call(experiment, "dry_run=true", *nothing) == (None, expected)
+    message, out = call(experiment, "dry_run=true", "loss.extra_terms=null")
+    assert message is None
+    assert "extra_terms=null" in out or "extra_terms" not in out
+
+
 @pytest.mark.parametrize("empty", ["tasks=[]", "variants=[]", "seeds=[]"])
 def test_an_empty_list_is_not_the_whole_experiment(call, mine, empty):
     message, out = call(f"experiment={mine()}", "dry_run=true", empty)

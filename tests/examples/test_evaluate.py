@@ -15,6 +15,7 @@ pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 
 from torchrl_etdmpc.collectors import Episodes, evaluate  # noqa: E402
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig  # noqa: E402
 from torchrl_etdmpc.envs import get_task, make_env  # noqa: E402
 from torchrl_etdmpc.inspector import with_settings  # noqa: E402
 from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
@@ -126,6 +127,14 @@ def test_an_agent_can_be_evaluated_on_another_task_of_its_size(checkpoint, run_m
     )
     assert (message, err) == (None, "")
     assert out.startswith("cartpole-swingup (bare, trained on cartpole-balance for 400 env steps): return ")
+
+
+def test_another_task_is_played_as_the_agent_s_own_was(tmp_path, save_untrained):
+    checkpoint = str(save_untrained(tmp_path, 5, task="cartpole-balance", action_repeat=4, episode_length=400))
+    spec = AgentCommandConfig(checkpoint=checkpoint, task="cartpole-swingup").task_spec
+    assert (spec.name, spec.action_repeat, spec.episode_length) == ("cartpole-swingup", 4, 400)
+    told = AgentCommandConfig(checkpoint=checkpoint, task="cartpole-swingup", action_repeat=2).task_spec
+    assert (told.action_repeat, told.episode_length) == (2, 400)
 
 
 def test_an_agent_of_a_gymnasium_task_is_evaluated_as_it_was_trained(tmp_path, run_main, save_untrained):

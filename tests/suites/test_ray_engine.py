@@ -28,10 +28,14 @@ class RayTaskError(RayError):
     cause = OSError("No space left on device")
 
 
+class TaskCancelledError(RayError):
+    """Of a task that was told to stop."""
+
+
 class FakeRay:
     """As much of Ray as the engine uses, in threads of this process; tasks in ``lost`` die with their node."""
 
-    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError, TaskCancelledError=TaskCancelledError)
 
     def __init__(self, *resources: dict[str, float], lost=()) -> None:
         self.resources = list(resources)
@@ -111,6 +115,30 @@ def test_a_run_whose_node_dies_is_begun_again(fake, small, tmp_path, stand_in):
     assert {read_progress(run).state for run in runs} == {"finished"}
     assert ray.given.count(runs[0].name) == 2
     assert f"{runs[0].name}: was stopped at 0 env steps (exit code -9); it is tried again" in said
+
+
+def test_a_trial_that_ends_early_is_cancelled_once_and_not_begun_again(fake, small, tmp_path, monkeypatch):
+    run = small.experiment(seeds=(1,)).runs(tmp_path)[0]
+    ray, queue = fake({"CPU": 4.0}), RunQueue([run])
+    told, saved = [], threading.Event()
+
+    def train(run, threads):
+        assert saved.wait(10)
+        error = RayTaskError()
+        error.cause = TaskCancelledError()
+        raise error
+
+    def cancel(reference):
+        told.append(reference)
+        threading.Timer(0.3, saved.set).start()  # the run takes its time to save itself
+
+    monkeypatch.setattr(ray_engine, "_train", train)
+    monkeypatch.setattr(ray, "cancel", cancel)
+    monkeypatch.setattr(queue, "to_be_stopped", lambda: queue._pruned.add(run.name) or {run.name})
+    assert run_on_ray(queue)
+    assert len(told) == 1
+    assert ray.given == [run.name]
+    assert read_progress(run).state == "pruned"
 
 
 @pytest.mark.parametrize(

@@ -428,6 +428,8 @@ REFUSED_AT_ONCE = [
     ({"seed": -1}, "seed must be in [0, 2**32 - 1], got -1."),
     ({"seed": 2**32}, "seed must be in [0, 2**32 - 1], got 4294967296."),
     ({"device": "tpu"}, "device must be one of auto, cpu, cuda, cuda:N, got 'tpu'."),
+    ({"device": "auto:3"}, "device must be one of auto, cpu, cuda, cuda:N, got 'auto:3'."),
+    ({"device": "cuda:"}, "device must be one of auto, cpu, cuda, cuda:N, got 'cuda:'."),
     ({"compile": "most"}, "compile must be one of auto, off, default, max, got 'most'."),
     ({"logger": "mlflow"}, "logger must be one of none, tensorboard, wandb, got 'mlflow'."),
 ]

@@ -56,6 +56,15 @@ def run(tiny_config, agent) -> float:
     return precompile.precompile(tiny_config(compile="default"), agent, (1,), (2,))
 
 
+def test_reanalyze_is_compiled_for_as_many_rows_as_a_sample_has(tiny_config, monkeypatch):
+    config = tiny_config(compile="default", optim={"batch_size": 4}, reanalyze={"num_slices": 9})
+    agent = build_agent(config, 5, 1)
+    shapes = []
+    monkeypatch.setattr(type(agent.reanalyze_planner), "forward", lambda _, states: shapes.append(states.batch_size))
+    precompile._parts(config, agent, (), (1,))["reanalyze"]()
+    assert shapes == [torch.Size([4 * config.loss.slice_len])]
+
+
 def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, agent):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)

@@ -182,6 +182,27 @@ def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(tmp_path, 
     assert results(resumed, tmp_path) == straight(config)
 
 
+def test_a_simulator_that_cannot_be_restored_does_not_begin_as_the_run_did(
+    tmp_path, small_config, make_run, monkeypatch
+):
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: None)
+    run = make_run(small_config(), tmp_path)
+    begun = run.learner.collector.step()["observation"]
+    for _ in range(4):
+        run.learner.collector.step()
+    run.checkpoints.save()
+    starts = []
+    for _ in range(2):
+        run.log.directory.close()
+        with pytest.warns(UserWarning, match="the environment cannot be restored, so fresh episodes begin"):
+            run = make_run(small_config(), tmp_path, resume=True)
+        rows = run.learner.replay.storage[:]
+        assert rows["next", "truncated"][-1]  # the episode that was running has an end
+        starts.append(run.learner.collector.step()["observation"])
+        run.checkpoints.save()
+    assert len({tuple(start.reshape(-1).tolist()) for start in (begun, *starts)}) == 3
+
+
 def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path, small_config, make_run):
     short = small_config(total_env_steps=100)
     run = make_run(short, tmp_path)

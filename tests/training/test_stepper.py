@@ -28,6 +28,15 @@ def test_a_step_of_the_trainer_is_an_update_targets_and_version_included():
     assert others["version"] == 3
 
 
+def test_a_batch_of_no_device_gets_the_new_priorities():
+    for device in (None, "cpu"):
+        batch = random_slices(3, 2)
+        batch["priority_weight"] = torch.ones(*batch.batch_size)
+        batch = batch.to("cpu") if device else batch.clear_device_()
+        UpdateStepper(make_updater()).step(None, batch)
+        assert (batch["td_error"] > 0).any()
+
+
 def test_its_state_is_the_updater_s():
     stepper, batch = UpdateStepper(make_updater()), random_slices(3, 2)
     stepper.step(None, batch)

@@ -476,6 +476,18 @@ def test_gradients_do_not_accumulate_over_updates():
             assert all(torch.equal(a, b) for a, b in zip(first, other, strict=True))
 
 
+@pytest.mark.parametrize(("argument", "value"), [("lr_halved_after", 100), ("average_decay", 0.9)])
+def test_a_state_that_lacks_what_this_updater_needs_is_refused_before_anything_changes(argument, value):
+    def make(**options):
+        return Updater(EfficientTDMPCLoss(WorldModel(3, 2, latent_dim=16, mlp_dim=16), discount=0.99), **options)
+
+    plain, other = make(), make(**{argument: value})
+    plain.step(random_slices(3, 2))
+    with pytest.raises(ValueError, match=f"is of an updater without {argument}; build this one without it, too"):
+        other.load_state_dict(plain.state_dict())
+    assert not other.optimizer.state_dict()["state"]
+
+
 def test_training_goes_on_bit_for_bit_from_a_saved_state():
     original, batches = make_updater(), [make_batch() for _ in range(5)]
     for seed, batch in enumerate(batches[:3]):

@@ -33,7 +33,7 @@ CHANGED = ("action_repeat", "episode_length")
 _NO_SETTING_OF_THE_METHOD = (
     *("task", "seed", "run_dir", "resume", "total_env_steps", "eval_every", "eval_episodes", "eval_policy"),
     *("device", "threads", "compile", "logger", "log_every", "checkpoint_every", "checkpoint_minutes"),
-    *("checkpoint_keep", "max_faults", "max_skipped", "workers", "engine", "overlap"),
+    *("checkpoint_keep", "max_faults", "max_skipped", "workers", "engine", "address", "overlap"),
 )
 _EVAL = RunDirectory("").eval.name
 _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}

@@ -18,10 +18,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_etdmpc.checkpoints.journal import ReplayJournal
+from torchrl_etdmpc.keys import PLAN
 from torchrl_etdmpc.runs.errors import first_line
 from torchrl_etdmpc.runs.files import (
     DamagedFileError,
@@ -72,6 +73,8 @@ class CheckpointStore:
 
     Keyword Args:
         keep (int): checkpoints that are kept; if the newest is damaged, the one before serves. Default: 2.
+        plan_key (NestedKey): group of the planner's targets in the rows, which reanalyze writes anew; see
+            :class:`ReplayJournal`. Default: ``"plan"``.
 
     >>> import tempfile, torch
     >>> from torchrl.data import LazyTensorStorage
@@ -82,12 +85,12 @@ class CheckpointStore:
     '000000000100'
     """
 
-    def __init__(self, folder: str | Path, *, keep: int = 2) -> None:
+    def __init__(self, folder: str | Path, *, keep: int = 2, plan_key: NestedKey = PLAN) -> None:
         if keep < 1:
             raise ValueError(f"keep must be at least 1, got {keep}.")
         self.folder = Path(folder)
         self.keep = keep
-        self.journal = ReplayJournal(self.folder / "replay")
+        self.journal = ReplayJournal(self.folder / "replay", plan_key=plan_key)
 
     def save(
         self,

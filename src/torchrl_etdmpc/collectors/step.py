@@ -54,6 +54,9 @@ class StepCollector(BaseCollector):
         exploration_type (ExplorationType): Default: ``RANDOM``.
         policy_device (torch.device, optional): where the policy's inputs go. Default: the environment's device.
 
+    Attributes:
+        begins_fresh (bool): whether :meth:`load_state_dict` could not bring the simulator back to where it was.
+
     Raises:
         ValueError: if an argument is out of range, or the environment does not fit a planner's model
             (:func:`~torchrl_etdmpc.envs.check_spaces`).
@@ -120,7 +123,9 @@ class StepCollector(BaseCollector):
         self._next_trajectory = 0
         self._carrier: TensorDictBase | None = None
         self._after_reset = False
-        self._last_rows: int | torch.Tensor | None = None
+        self._last_rows: tuple[Any, torch.Tensor] | None = None  # of the buffer, and the trajectories that they are of
+        self._ended_rows: dict[int, int] = {}  # row to trajectory, of episodes that a fault has ended
+        self.begins_fresh = False
         self._pending: list[list[TensorDictBase]] = [[] for _ in range(self.num_envs)]
         self._schema: dict[bool, set] = {}
         excluded = set(self.exclude_keys)
@@ -182,7 +187,7 @@ class StepCollector(BaseCollector):
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
         self._check_schema(kept, self.in_seed_phase)
-        self._store(kept)
+        self._store(kept, stepped.get(TRAJECTORY))
         self._frames += self.num_envs
         self._carrier = self._next_carrier(carrier, stepped)
         return stepped
@@ -222,10 +227,11 @@ class StepCollector(BaseCollector):
                 self._next_trajectory += 1
         return carrier.set(TRAJECTORY, ids)
 
-    def _store(self, kept: TensorDictBase) -> None:
+    def _store(self, kept: TensorDictBase, trajectories: torch.Tensor) -> None:
         if self.insertion == "step":
             # Adding one row takes half the time of extending by it.
-            self._last_rows = self.replay_buffer.extend(kept) if kept.ndim else self.replay_buffer.add(kept)
+            rows = self.replay_buffer.extend(kept) if kept.ndim else self.replay_buffer.add(kept)
+            self._last_rows = rows, trajectories
             return
         for position, row in enumerate(kept.reshape(-1).unbind(0)):
             self._pending[position].append(row.clone())
@@ -246,13 +252,27 @@ class StepCollector(BaseCollector):
                 _truncate(episode[-1:])
                 self.replay_buffer.extend(episode)
         if self._last_rows is not None:
-            last = self.replay_buffer.storage.get(self._last_rows).clone()
-            _truncate(last)
-            self.replay_buffer.storage.set(self._last_rows, last, set_cursor=False)
-            end_episodes = getattr(self.replay_buffer.sampler, "end_episodes", None)
-            if end_episodes is not None:  # it may have followed the rows already
-                end_episodes(self._last_rows, self.replay_buffer.storage)
+            self._end_rows(*(torch.as_tensor(entry).reshape(-1).cpu() for entry in self._last_rows))
         self._abandon_episodes()
+
+    def _end_rows(self, rows: torch.Tensor, trajectories: torch.Tensor) -> None:
+        """Makes rows of the buffer truncated ends, where they still are of these trajectories."""
+        storage = self.replay_buffer.storage
+        there = rows < len(storage)
+        rows, trajectories = rows[there], trajectories[there]
+        if len(rows):
+            held = storage.get(rows).clone()
+            now = held.get(TRAJECTORY, None)
+            same = torch.ones_like(rows, dtype=torch.bool) if now is None else now.reshape(-1).cpu() == trajectories
+            rows, trajectories, held = rows[same], trajectories[same], held[same.to(held.device or "cpu")]
+        if not len(rows):
+            return
+        _truncate(held)
+        storage.set(rows, held, set_cursor=False)
+        self._ended_rows |= dict(zip(rows.tolist(), trajectories.tolist(), strict=True))
+        end_episodes = getattr(self.replay_buffer.sampler, "end_episodes", None)
+        if end_episodes is not None:  # it may have followed the rows already
+            end_episodes(rows, storage)
 
     def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:
         for key in keys:
@@ -317,14 +337,19 @@ class StepCollector(BaseCollector):
             simulator=self._simulator_state(),
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
+            last_rows=self._last_rows and [torch.as_tensor(entry).reshape(-1).cpu() for entry in self._last_rows],
+            ended_rows=dict(self._ended_rows),
             seed_policy=seeding.state_dict() if (seeding := self._seeding_module()) else None,
         )
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
         """Restores :meth:`state_dict`; collection goes on inside the episodes that were running.
 
-        Where the environment cannot be brought back (:func:`~torchrl_etdmpc.envs.simulator_state`), fresh episodes with
-        fresh trajectory ids begin, and a warning says so.
+        Where the environment cannot be brought back (:func:`~torchrl_etdmpc.envs.simulator_state`), the episodes that
+        were running end at their last step, as truncated ones, fresh ones with fresh trajectory ids begin, and a
+        warning says so; :attr:`begins_fresh` is ``True`` then. The environment begins as it would anew: give it
+        another seed (:meth:`set_seed`) if it is not to repeat itself. Call this when the buffer and its sampler are
+        restored: the ends that faults have made are written into the rows again.
         """
         self._frames = state_dict["frames"]
         self._next_trajectory = state_dict["next_trajectory"]
@@ -332,9 +357,18 @@ class StepCollector(BaseCollector):
         if seeding is not None and held is not None:
             seeding.load_state_dict(held)
         self._abandon_episodes()
+        self._ended_rows = {}
+        ended = state_dict.get("ended_rows") or {}  # nor have they this, and the last rows
+        self._end_rows(torch.tensor(list(ended), dtype=torch.int64), torch.tensor(list(ended.values())))
+        batch_size, device = self.env.batch_size, self.env.device
+        self._pending = [[TensorDict(row, [], device=device) for row in rows] for rows in state_dict["pending"]]
+        last_rows = state_dict.get("last_rows")
+        self._last_rows = None if last_rows is None else (last_rows[0], last_rows[1])
+        self.begins_fresh = self._frames > 0
         if state_dict.get("simulator") is None:
             if self._frames:
                 warnings.warn("the environment cannot be restored, so fresh episodes begin.", stacklevel=2)
+            self._truncate_episodes()
             return
         if not load_simulator_state(self.env, state_dict["simulator"]):
             warnings.warn(
@@ -342,13 +376,12 @@ class StepCollector(BaseCollector):
                 "begin.",
                 stacklevel=2,
             )
+            self._truncate_episodes()
             return
-        if state_dict["carrier"] is None:  # between episodes
-            return
-        batch_size, device = self.env.batch_size, self.env.device
-        self._carrier = TensorDict(state_dict["carrier"], batch_size, device=device)
-        self._after_reset = True  # if it is not, nothing is lost by looking twice
-        self._pending = [[TensorDict(row, [], device=device) for row in rows] for rows in state_dict["pending"]]
+        self.begins_fresh = False
+        if state_dict["carrier"] is not None:  # else between episodes
+            self._carrier = TensorDict(state_dict["carrier"], batch_size, device=device)
+            self._after_reset = True  # if it is not, nothing is lost by looking twice
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(num_envs={self.num_envs}, frames={self._frames}, insertion={self.insertion!r})"

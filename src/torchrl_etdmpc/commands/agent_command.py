@@ -42,7 +42,8 @@ class AgentCommandConfig:
         told = {name: value for name, value in changes.items() if value is not None}
         stored = trained_with(self.checkpoint)
         if self.task is not None and self.task != stored.task:
-            return get_task(self.task, **told)
+            changed = {name: getattr(stored, name) for name in changes if getattr(stored, name) is not None}
+            return get_task(self.task, **(changed | told))
         return dataclasses.replace(stored.task_spec, **told)
 
 

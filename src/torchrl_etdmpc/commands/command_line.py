@@ -250,14 +250,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean {' or '.join(found)}? --help lists all." if found else "--help lists all."
 
 
-def explicit_settings(arguments: list[str] | None = None) -> list[str]:
-    """Settings that the command line names, e.g. ``planner.horizon``, without the preset and Hydra's own.
-
-    Args:
-        arguments (list of str, optional): Default: those of this process.
-    """
-    given = sys.argv[1:] if arguments is None else arguments
-    names = [argument.lstrip("+").partition("=")[0] for argument in given if "=" in argument]
+def explicit_settings() -> list[str]:
+    """Settings that the command line names, e.g. ``planner.horizon``, without Hydra's own."""
+    names = [argument.lstrip("+").partition("=")[0] for argument in sys.argv[1:] if "=" in argument]
     return [name for name in names if not name.startswith(("hydra", "-", "~"))]
 
 

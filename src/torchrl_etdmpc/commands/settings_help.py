@@ -15,7 +15,8 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-_TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
+from torchrl_etdmpc.training import TASK_SETTINGS
+
 _NAME_WIDTH = 34
 
 
@@ -75,7 +76,7 @@ def settings_of(config_class: type, prefix: str = "") -> dict[str, Setting]:
         if dataclasses.is_dataclass(hint):
             found |= settings_of(typing.cast(type, hint), f"{field.name}.")
             continue
-        name = f"task.{field.name}" if not prefix and field.name in _TASK_SETTINGS else f"{prefix}{field.name}"
+        name = f"task.{field.name}" if not prefix and field.name in TASK_SETTINGS else f"{prefix}{field.name}"
         meaning = meanings.get(field.name, "")
         for own_name in (f" ({name} on the command line)", f" ({name})"):
             meaning = meaning.replace(own_name, "")  # a docstring says it, where the name stands before it here

@@ -6,13 +6,14 @@ import dataclasses
 import shlex
 import sys
 import time
+import typing
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_etdmpc.commands.command_line import nearest, one_line_errors
-from torchrl_etdmpc.commands.settings_help import help_text, settings_of
+from torchrl_etdmpc.commands.settings_help import Setting, help_text, settings_of
 from torchrl_etdmpc.envs import import_task
 from torchrl_etdmpc.runs import RunDirectory, console
 from torchrl_etdmpc.suites import (
@@ -245,6 +246,12 @@ def _import_own_code(config: SuiteConfig, settings: dict[str, Any], experiments:
                 follow_own_code(setting, path)
 
 
+def _typed(setting: Setting, text: str, as_it_is: bool) -> Any:
+    if text == "null" and type(None) in typing.get_args(setting.hint):  # as --help prints a default that is none
+        return None
+    return text if as_it_is else _value(text)
+
+
 def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
     """The suite's own settings, and those of training."""
     own = settings_of(SuiteConfig)
@@ -258,9 +265,10 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
         if not text and name in ("tasks", "seeds", "variants"):  # of an unset variable of the shell
             raise ValueError(f"{name} must not be empty; leave it out for all that the experiment has.")
         if name in own:
-            values[name] = text if own[name].is_text or own[name].choices else _value(text)
+            value = _typed(own[name], text, own[name].is_text or bool(own[name].choices))
+            values |= {} if value is None else {name: value}  # the default of all that may be null
         elif name in training:
-            settings[name] = text if training[name].is_text else _value(text)
+            settings[name] = _typed(training[name], text, training[name].is_text)
         elif name in INSTEAD:
             raise ValueError(f"{name} is not for a suite, which gives it to each run; {INSTEAD[name]}.")
         else:

@@ -266,7 +266,7 @@ class Inspection:
         frames: list[np.ndarray] = []
         try:
             for step in steps:
-                self._at(episode.states[step])
+                self.simulator.restore(episode.states[step])
                 frames.append(self.simulator.frame(FRAME_SIZE, FRAME_SIZE).numpy())
         except (RuntimeError, ValueError) as error:
             self.cannot_render = f"There are no frames: {_sentence(error)}"
@@ -281,16 +281,13 @@ class Inspection:
             self._simulator = Simulator(self.task)
         return self._simulator
 
-    def _at(self, state: Any) -> None:
-        self.simulator.restore(state)
-
     def _simulated(self, trace: Trace, planner: EnsembleMPPIPlanner, place: Any) -> tuple[Trace, list[str]]:
         """The trace with what became of its plan in the simulator, or why that is not known."""
         actions, notes = torch.from_numpy(trace["chosen_actions"]), []
         if self.cannot_render:
             notes.append(self.cannot_render)
         try:
-            self._at(place)
+            self.simulator.restore(place)
             frames = None
             if not self.cannot_render:
                 frames = [self.simulator.frame(FRAME_SIZE, FRAME_SIZE)]

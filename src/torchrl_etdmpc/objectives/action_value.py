@@ -94,6 +94,8 @@ def action_value_error(
     """
     heads = world_model.num_dynamics
     rows = head_rows(rollout.predicted[:-1]), head_rows(slices.action, heads)
+    # Departure from the thesis, whose Eq. 2.14 has the squared error: the cross-entropy over bins, as in TD-MPC2's
+    # code.
     logits = world_model.value_head(*rows, dropout=dropout)  # [V, 1 + (T - 1) F, B, M]
     error = two_hot_cross_entropy(logits, head_rows(target, heads), world_model.bins)
     return mean_of_head_rows(error.mean(0), heads)

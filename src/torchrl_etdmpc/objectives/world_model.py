@@ -28,6 +28,8 @@ def consistency_error(rollout: LatentRollout) -> Tensor:
     >>> consistency_error(LatentRollout(torch.zeros(3, 4, 16), torch.ones(3, 2, 4, 16))).tolist()
     [[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0]]
     """
+    # Departure from the thesis, whose Eq. 2.11 has the squared norm: the mean over the latent, as in TD-MPC2's code,
+    # for which the coefficient of 20 is meant.
     return (rollout.predicted[1:] - rollout.encoded[1:].unsqueeze(1)).square().mean(-1).mean(1)
 
 

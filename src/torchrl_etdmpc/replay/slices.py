@@ -137,8 +137,9 @@ class StepSliceSampler(Sampler):
             rows (int or Tensor): of the storage.
             storage (TensorStorage): what this sampler samples from.
         """
-        if self._newest is not None:
-            before = (int(self._newest) - torch.as_tensor(rows).reshape(-1).cpu().numpy()) % storage.max_size
+        if self._written:
+            newest = self._written - 1 if self._newest is None else int(self._newest)  # not known after loading
+            before = (newest - torch.as_tensor(rows).reshape(-1).cpu().numpy()) % storage.max_size
             self._trajectories.end(self._written - 1 - before)
             self._starts = None
 

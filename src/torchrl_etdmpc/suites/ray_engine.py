@@ -68,6 +68,7 @@ def run_on_ray(
                 "gpus_per_run."
             )
         running: dict[Any, Run] = {}
+        told: set[Any] = set()  # a second cancel would break off the run that saves itself
         try:
             while not stop.requested and (queue.left or running):
                 room = workers or max(_room(ray, cpus_per_run, gpus), 1)
@@ -78,12 +79,10 @@ def run_on_ray(
                 for reference in ended:
                     _take_back(ray, reference, running.pop(reference), queue)
                 pruned = queue.to_be_stopped()
-                for reference, run in running.items():
-                    if run.name in pruned:
-                        ray.cancel(reference)
+                _cancel(ray, [reference for reference, run in running.items() if run.name in pruned], told)
                 time.sleep(0 if running else _POLL_S)
         finally:
-            _stop(ray, running, queue)
+            _stop(ray, running, queue, told)
     return not stop.requested
 
 
@@ -101,8 +100,11 @@ def _train(run: Run, threads: int) -> int:
 def _take_back(ray: Any, reference: Any, run: Run, queue: RunQueue) -> None:
     try:
         queue.ended(run, ray.get(reference))
-    except ray.exceptions.RayTaskError as error:  # the node cannot write the folder, or lacks the package
-        queue.failed_to_begin(run, first_line(error.cause or error))
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, ray.exceptions.TaskCancelledError):  # before it had begun, or as it ended
+            queue.ended(run, _LOST)
+        else:  # the node cannot write the folder, or lacks the package
+            queue.failed_to_begin(run, first_line(error.cause or error))
     except ray.exceptions.RayError:
         queue.ended(run, _LOST)
 
@@ -118,13 +120,19 @@ def _room(ray: Any, cpus: float, gpus: float) -> int:
     return total
 
 
-def _stop(ray: Any, running: dict[Any, Run], queue: RunQueue) -> None:
+def _cancel(ray: Any, references: list[Any], told: set[Any]) -> None:
+    for reference in references:
+        if reference not in told:
+            ray.cancel(reference)
+    told.update(references)
+
+
+def _stop(ray: Any, running: dict[Any, Run], queue: RunQueue, told: set[Any]) -> None:
     """Asks every run to save itself and leave, and waits for it."""
     if not running:
         return
     queue.say(f"stopping: {len(running)} run{'s save themselves' if len(running) > 1 else ' saves itself'}")
-    for reference in running:
-        ray.cancel(reference)
+    _cancel(ray, list(running), told)
     ray.wait(list(running), num_returns=len(running))
 
 

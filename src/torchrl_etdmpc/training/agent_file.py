@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError
@@ -117,7 +118,8 @@ class BestAgent:
 
     def state_dict(self) -> dict[str, Any]:
         """The file's content, and the return of its evaluation."""
-        return {"return_mean": self.return_mean, "file": torch.tensor(memoryview(self._content), dtype=torch.uint8)}
+        content = torch.from_numpy(np.frombuffer(self._content, dtype=np.uint8).copy())
+        return {"return_mean": self.return_mean, "file": content}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restores :meth:`state_dict`, and the file if it holds something else by now."""

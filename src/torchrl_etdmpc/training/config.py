@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -257,7 +258,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         _check_types(self)
         _require(
-            self.device.split(":")[0] in ("auto", "cpu", "cuda"),
+            re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device) is not None,
             f"device must be one of auto, cpu, cuda, cuda:N, got {self.device!r}.",
         )
         _require(

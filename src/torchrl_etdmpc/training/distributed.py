@@ -113,6 +113,8 @@ class WorkerCollector:
     >>> collector.shutdown()
     """
 
+    begins_fresh = False  # workers begin fresh episodes, each from a seed of its own
+
     def __init__(
         self, config: DistributedConfig, agent: Agent, env: EnvBase, replay_buffer: ReplayBuffer, *, exclude_keys: tuple
     ) -> None:

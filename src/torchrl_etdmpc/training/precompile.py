@@ -135,7 +135,7 @@ def _parts(
 
     def reanalyze() -> None:
         if config.reanalyze.every:
-            rows = config.reanalyze.num_slices * config.loss.slice_len
+            rows = min(config.reanalyze.num_slices, config.optim.batch_size) * config.loss.slice_len
             with set_exploration_type(ExplorationType.RANDOM):
                 agent.reanalyze_planner(states(rows).select("observation"))
 

@@ -126,6 +126,8 @@ class RunCheckpoints:
             raise CheckpointError(
                 f"{error} Start a new run; the agents of this one can still be evaluated: {', '.join(left)}."
             ) from error
+        if self.learner.collector.begins_fresh:
+            self._begin_elsewhere()
         self._saved_step = self.learner.env_steps
         torchrl_logger.info(f"going on from {folder} ({self._saved_step} env steps)")
 
@@ -139,8 +141,13 @@ class RunCheckpoints:
                 f"cannot resume: {len(replay)} rows of the buffer are left, fewer than the {least} that learning "
                 "begins with; start a new run."
             )
-        collector.set_seed((self.config.seed + collector.frames) % 2**32)  # the buffer may end in another episode
+        self._begin_elsewhere()  # the buffer may end in another episode
         return folder
+
+    def _begin_elsewhere(self) -> None:
+        """Gives the environment another seed: with the run's own it would begin as the run did, at every resume."""
+        collector = self.learner.collector
+        collector.set_seed((self.config.seed + collector.frames) % 2**32)
 
 
 def _is_whole(path: Path) -> bool:

@@ -14,7 +14,9 @@ class UpdateStepper(OptimizationStepper):
     """Makes the updates of a :class:`torchrl.trainers.Trainer` with an :class:`Updater`.
 
     That is the two clipped gradients, Adam, the average of the targets and the count of updates. The batches are slices
-    [B, T], as a buffer with ``StepSliceSampler(as_slices=True)`` samples them.
+    [B, T], as a buffer with ``StepSliceSampler(as_slices=True)`` samples them. With a stepper of one's own TorchRL's
+    trainer (0.14) runs no ``post_loss`` hooks, so ``ReplayBufferTrainer`` does not update priorities: the new ones are
+    in the batch.
 
     Args:
         updater (Updater): of the trainer's loss.
@@ -30,7 +32,13 @@ class UpdateStepper(OptimizationStepper):
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """One update; returns losses, metrics and gradient norms."""
-        return self.updater.step(sub_batch.to(self.updater.loss.world_model.version.device))
+        loss = self.updater.loss
+        there = sub_batch.to(loss.world_model.version.device)
+        terms = self.updater.step(there)
+        priority = there.get(loss.tensor_keys.priority, None)
+        if there is not sub_batch and priority is not None:
+            sub_batch.set(loss.tensor_keys.priority, priority)
+        return terms
 
     def state_dict(self) -> dict[str, Any]:
         """That of the updater; the trainer saves the loss, and with it weights, targets and the count of updates."""

@@ -83,8 +83,8 @@ class TrainingRun:
         self.parts: dict[str, Part] = {
             "agent": file,
             "best": self.best,
-            "collector": collector,
             "sampler": self.learner.replay.sampler,
+            "collector": collector,  # after the rows and who follows them: it may end episodes
             **({} if self.learner.reanalyze is None else {"reanalyze": self.learner.reanalyze}),
             "learner": self.learner,
             "log": log,
@@ -171,7 +171,7 @@ class TrainingRun:
                 self._after_work()
                 progress.update(self.learner.pretrained)
         self.state.stage = "learn"
-        if self.config.seed_decisions and self.learner.passed(self.config.eval_every):
+        if self.learner.passed(self.config.eval_every):
             self.state.due.append("evaluation")
         self._do_what_is_due()
 

@@ -266,7 +266,15 @@ class Updater:
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores :meth:`state_dict`."""
+        """Restores :meth:`state_dict`.
+
+        Raises:
+            ValueError: if it is of an updater without a schedule or averages that this one has.
+        """
+        needed = {"schedule": ("lr_halved_after", self._schedule), "averaged": ("average_decay", self.average_decay)}
+        for entry, (argument, own) in needed.items():
+            if own and entry not in state_dict:
+                raise ValueError(f"the state is of an updater without {argument}; build this one without it, too.")
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])

@@ -7,7 +7,7 @@ colour-blind people. Backgrounds are transparent, so that a page can be light, d
 from __future__ import annotations
 
 from torchrl_etdmpc.inspector.figures.drawing import Drawing, empty, plain
-from torchrl_etdmpc.inspector.figures.heads import candidate_table, disagreement, mixture_weights, return_table
+from torchrl_etdmpc.inspector.figures.heads import disagreement, mixture_weights, return_table
 from torchrl_etdmpc.inspector.figures.plane import latent_plane
 from torchrl_etdmpc.inspector.figures.plans import (
     compare_plans,
@@ -20,7 +20,6 @@ from torchrl_etdmpc.inspector.figures.plans import (
 __all__ = [
     "FIGURES",
     "Drawing",
-    "candidate_table",
     "compare_plans",
     "disagreement",
     "empty",

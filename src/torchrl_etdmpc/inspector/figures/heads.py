@@ -22,18 +22,13 @@ from torchrl_etdmpc.inspector.trace import Trace
 _LINES = ("elites", "all candidates", "chosen", "policy", "clicked")
 
 
-def candidate_table(trace: Trace, iteration: int, candidate: int) -> np.ndarray | None:
-    """Return table ``[D, F, V]`` of a candidate."""
-    return None if trace.get("returns") is None else trace["returns"][iteration, candidate]
-
-
 @figure_of
 def return_table(trace: Trace, iteration: int = -1, candidate: int | None = None) -> Drawing:
     """Return table of a candidate, depth x dynamics head and value head; by default that of the chosen sequence."""
     if candidate is None:
         table, title = trace.get("chosen_returns"), "chosen sequence"
     else:
-        table = candidate_table(trace, iteration, candidate)
+        table = None if trace.get("returns") is None else trace["returns"][iteration, candidate]
         title = f"candidate {candidate}, score {trace['scores'][iteration, candidate]:.3f}"
     if table is None:
         return plain(empty)("this planner has no return table")
