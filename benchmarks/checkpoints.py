@@ -20,7 +20,7 @@ from memory import HUMANOID, MILLION, RESULTS, humanoid_row
 
 from torchrl_etdmpc.checkpoints import CheckpointStore
 from torchrl_etdmpc.runs import library_versions
-from torchrl_etdmpc.training import AgentFile, TrainConfig, build_agent, build_replay, preset, row_bytes
+from torchrl_etdmpc.training import AgentFile, BestAgent, TrainConfig, build_agent, build_replay, preset, row_bytes
 
 NEW_ROWS, REFRESHED, SAVES = 25_000, 150_000, 6
 
@@ -45,11 +45,13 @@ def main() -> None:
         patch["plan", "version"] = torch.full((len(index), 1), int(agent.world_model.version))
         buffer.update_if_present(index=index, generation=buffer.writer.generations_of(index), patch=patch)
 
-    parts = {"agent": AgentFile(agent, config, dict)}
     write(MILLION)
     seconds, sizes = [], []
     with tempfile.TemporaryDirectory() as folder:
-        store = CheckpointStore(Path(folder))
+        store, file = CheckpointStore(Path(folder)), AgentFile(agent, config, dict)
+        best = BestAgent(file, Path(folder) / "best.pt")
+        best.note(0.0)
+        parts = {"agent": file, "best": best}
         for number in range(SAVES + 1):
             if number:
                 write(NEW_ROWS)

@@ -84,13 +84,14 @@ check_env(make_env(task, seed=0))
 # Training
 # --------
 # The world model gets a termination head because the task terminates, and slices may begin in an episode's last
-# steps, so that ends are learned from as often as other steps.
+# steps, so that ends are learned from as often as other steps. What is not written here has the defaults, which are
+# those of ``efficient-tdmpc``; ``dataclasses.replace(preset("cpu"), ...)`` begins with those of ``cpu``.
 
 run_dir = Path(tempfile.mkdtemp()) / "track"
 planner = {"horizon": 3, "num_samples": 32, "num_elites": 6, "num_proposals": 2, "iterations": 3}
 config = TrainConfig.from_dict(
     {
-        **{"task": "track", "preset": "cpu", "total_env_steps": 900, "run_dir": str(run_dir)},
+        **{"task": "track", "total_env_steps": 900, "run_dir": str(run_dir)},
         **{"eval_every": 300, "eval_episodes": 5, "log_every": 100, "compile": "off", "threads": 1},
         "model": {"latent_dim": 32, "mlp_dim": 64, "encoder_dim": 64, "num_dynamics": 2},
         "planner": planner,

@@ -32,7 +32,6 @@ def config(name, **changes):
     return TrainConfig.from_dict(
         {
             "task": "gym/Pendulum-v1",
-            "preset": "cpu",
             "total_env_steps": 500,
             "eval_every": 250,
             "eval_episodes": 2,

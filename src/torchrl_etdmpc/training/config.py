@@ -360,6 +360,9 @@ class TrainConfig:
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
         """Inverse of :meth:`to_dict`; missing entries take the default.
 
+        That is so whatever ``preset`` says, which is a name here; ``dataclasses.replace(preset("cpu"), ...)`` begins
+        with the values of a preset.
+
         Raises:
             ValueError: if a key is unknown, or a value has the wrong type or is out of range.
         """
