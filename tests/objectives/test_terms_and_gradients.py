@@ -141,14 +141,15 @@ def test_entries_that_the_loss_does_not_know_have_no_influence(loss, slices, run
     assert "td_error" not in out.keys()
 
 
+@pytest.mark.parametrize("number", [0.3, torch.tensor(0.3)], ids=["number", "tensor"])
 @pytest.mark.parametrize(("kind", "term"), _KIND_AND_TERM)
-def test_a_coefficient_can_be_assigned_in_place_and_weighs_its_term(make_loss, world_model, kind, slices, term):
+def test_a_coefficient_can_be_assigned_in_place_and_weighs_its_term(make_loss, world_model, kind, slices, term, number):
     loss = make_loss(kind, world_model).eval()
     buffer = getattr(loss, f"{term}_coef")
     setattr(loss, f"{term}_coef", 1.0)
     torch.manual_seed(7)
     one = loss(slices)[f"loss_{term}"]
-    setattr(loss, f"{term}_coef", 0.3)
+    setattr(loss, f"{term}_coef", number)
     torch.manual_seed(7)
     torch.testing.assert_close(loss(slices)[f"loss_{term}"], 0.3 * one)
     assert getattr(loss, f"{term}_coef") is buffer

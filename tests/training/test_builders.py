@@ -104,9 +104,15 @@ def test_auto_is_the_cuda_device_where_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("auto") == torch.device("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    current, precisions = [], []
+    monkeypatch.setattr(torch.cuda, "set_device", current.append)
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", precisions.append)
     assert resolve_device("auto") == torch.device("cuda")
     assert resolve_device("cuda:1") == torch.device("cuda", 1)
+    assert current == [torch.device("cuda", 1)]  # whose copies TensorDict waits for
+    assert precisions == ["high", "high"]
     assert resolve_device("cpu") == torch.device("cpu")
+    assert precisions == ["high", "high"]
 
 
 @pytest.mark.parametrize("name", ["cuda", "cuda:0"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import math
 import os
 import signal
@@ -27,7 +28,10 @@ from torchrl_etdmpc.training import (  # noqa: E402
     DistributedConfig,
     Learner,
     TrainConfig,
+    build_agent,
+    build_replay,
     launch,
+    preset,
     read_agent_file,
     read_run_config,
 )
@@ -398,3 +402,24 @@ def test_actors_of_a_ray_cluster_collect_and_the_cluster_ends(tmp_path, monkeypa
         monkeypatch.setattr(ray, "cluster_resources", lambda: {"CPU": 1.0})
         RayCluster(None, workers=3)
     assert not ray.is_initialized()
+
+
+def test_workers_plan_as_a_cpu_compiles_wherever_the_learner_is(monkeypatch):
+    settings = {"task": "gym/Pendulum-v1", "workers": 2, "compile": "default", "total_env_steps": 20_000}
+    config = DistributedConfig.from_dict(preset("cpu").to_dict() | settings)
+    agent = build_agent(config, observation_dim=3, action_dim=1)
+    agent = dataclasses.replace(agent, compile_mode="reduce-overhead")  # as on a GPU
+    agent.planner.compiled_plan = agent.planner.plan
+    told = []
+
+    def start(parts, **_):
+        told.append(parts.compile_mode)
+        raise RuntimeError("no workers are needed here")
+
+    monkeypatch.setattr(distributed, "start_workers", start)
+    options = {"replay_buffer": build_replay(config), "exclude_keys": ()}
+    collector = distributed.WorkerCollector(config, agent, make_env(config.task), **options)
+    with pytest.raises(Exception, match="no workers are needed here"):
+        collector.act()
+    collector.shutdown()
+    assert told[0] == "default"

@@ -53,8 +53,8 @@ class LatentRolloutLoss(LossModule):
     """A loss made of terms, which trains a :class:`~torchrl_etdmpc.modules.WorldModel` on replayed slices.
 
     What it trains, reads and returns follows from its terms. Every term is weighted once, by the coefficient buffer
-    ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are. A coefficient is assigned like a number
-    (``loss.reward_coef = 0.3``), in place.
+    ``<term>_coef``; ``loss_*`` entries can therefore be summed as they are. A coefficient is assigned like a number or
+    a tensor of no dimension (``loss.reward_coef = 0.3``), in place.
 
     Networks stay shared with the world model that was passed: the planner that holds it sees every update. Every step
     of a PyTorch optimiser that trains them counts as one in ``world_model.version``, which dates the planner's targets
@@ -219,8 +219,9 @@ class LatentRolloutLoss(LossModule):
     def __setattr__(self, name: str, value: Any) -> None:
         # TorchRL has a list of such buffers for a class; here each loss has those of its terms.
         scalars = (*vars(self).get("_scalars", ()), "rho")
-        if isinstance(value, int | float) and name in scalars and name in self._buffers:
-            self.get_buffer(name).fill_(value)
+        number = isinstance(value, int | float) or (isinstance(value, Tensor) and value.ndim == 0)
+        if number and name in scalars and name in self._buffers:
+            self.get_buffer(name).fill_(value)  # a tensor's value as well: the buffer stays where it is
         else:
             super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]  # TorchRL's annotation is too narrow
 
@@ -443,7 +444,8 @@ class LatentRolloutLoss(LossModule):
         """Moves the priorities of a batch, if there are some, from what :meth:`evaluate` returned into the batch."""
         priority = evaluated.pop(PRIORITY, None)
         if priority is not None:
-            tensordict.set(self.tensor_keys.priority, priority)
+            # A copy: the memory may be that of a CUDA graph, which its next replay overwrites.
+            tensordict.set(self.tensor_keys.priority, priority.clone())
 
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -23,19 +23,24 @@ UNREAD = (
 def resolve_device(name: str) -> torch.device:
     """The device behind ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
 
+    A CUDA device becomes PyTorch's current one, and products on it may use TF32, as in training.
+
     Raises:
         ValueError: if CUDA is asked for and not there.
 
     >>> resolve_device("cpu")
     device(type='cpu')
     """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(name)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(
-            f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
-        )
+    there = torch.cuda.is_available()
+    device = torch.device(("cuda" if there else "cpu") if name == "auto" else name)
+    if device.type == "cuda":
+        if not there:
+            raise ValueError(
+                f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
+            )
+        if device.index is not None:  # a copy to the CPU waits for the current device alone, inside of TensorDict
+            torch.cuda.set_device(device)
+        torch.set_float32_matmul_precision("high")
     return device
 
 

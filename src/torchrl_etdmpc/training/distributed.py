@@ -19,6 +19,7 @@ from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.keys import NEXT, PLAN, VALUE, VERSION, WORKER
 from torchrl_etdmpc.runs import first_line
 from torchrl_etdmpc.training.agent import Agent
+from torchrl_etdmpc.training.compilation import resolve_compile
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.ray_cluster import RayCluster
 from torchrl_etdmpc.training.workers import Actor, Engine, WorkerParts, send_weights, start_workers, why_it_failed
@@ -184,7 +185,10 @@ class WorkerCollector:
         observation_dim = agent.world_model.observation_dim
         assert observation_dim is not None  # training takes vectors
         sizes = observation_dim, agent.world_model.action_dim
-        compiled = agent.compile_mode if agent.planner.compiled_plan is not None else None
+        compiled = None
+        if agent.planner.compiled_plan is not None:  # for the CPU, where workers plan, wherever the learner is
+            decisions = config.total_decisions - config.seed_decisions
+            compiled = resolve_compile(config.compile, torch.device("cpu"), decisions)
         parts = WorkerParts(config, sizes, agent.planner.discount, compiled)
         self._numbers = range(self._next_number, self._next_number + config.workers)
         self._next_number += config.workers
