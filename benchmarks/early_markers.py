@@ -70,14 +70,14 @@ def ranges(folders: dict[str, Path]) -> str:
     return memory.getvalue()
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Writes the committed runs' table, or prints that of the folders that are named."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="*", metavar="NAME=FOLDER", help="a name and a folder with run directories below")
-    arguments = parser.parse_args().runs
-    own = {name: Path(folder) for name, _, folder in (argument.partition("=") for argument in arguments) if folder}
-    if len(own) < len(arguments):
-        parser.error(f"every argument must be NAME=FOLDER with a name of its own, got {' '.join(arguments)}")
+    named = parser.parse_args(arguments).runs
+    own = {name: Path(folder) for name, _, folder in (argument.partition("=") for argument in named) if folder}
+    if len(own) < len(named):
+        parser.error(f"every argument must be NAME=FOLDER with a name of its own, got {' '.join(named)}")
     try:
         text = ranges(own or COMMITTED)
     except ValueError as error:

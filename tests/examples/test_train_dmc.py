@@ -199,7 +199,7 @@ REFUSED = [
     ("resume=true", "run_dir=runs/walker-walk/efficient-tdmpc/seed1 holds no run to go on with; start it with "),
     ("logger=wandb", "logger=wandb needs wandb, which is not installed; run `pip install wandb`."),
     ("device=cuda", "device=cuda needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."),
-    ("device=cuda:first", "Invalid device string: 'cuda:first'"),
+    ("device=cuda:first", "device must be one of auto, cpu, cuda, cuda:N, got 'cuda:first'."),
     ("run_dir=taken/run", "run_dir=taken/run cannot be written (Not a directory); choose a directory that you can "),
 ]
 
