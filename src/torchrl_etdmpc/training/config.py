@@ -338,6 +338,12 @@ class TrainConfig:
         return max(1000, 5 * self.task_spec.decision_steps_per_episode)
 
     @property
+    def refreshed_states(self) -> int:
+        """States that a reanalyze plans for, which a batch must have; 0 without reanalyze."""
+        slices = min(self.reanalyze.num_slices, self.optim.batch_size) if self.reanalyze.every else 0
+        return slices * self.loss.slice_len
+
+    @property
     def pretrain_updates(self) -> int:
         """Updates between the random phase and learning."""
         return self.seed_decisions if self.replay.pretrain_updates is None else self.replay.pretrain_updates

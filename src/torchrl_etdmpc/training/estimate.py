@@ -26,8 +26,7 @@ def decision_flops(config: TrainConfig) -> tuple[float, float]:
     plan = _plan_flops(model, config.planner)
     rows = optim.batch_size * loss.slice_len
     update = 3 * rows * (model.num_dynamics * (_step_flops(model) + _value_flops(model)) + _value_flops(model))
-    refreshed = min(again.num_slices, optim.batch_size) * loss.slice_len
-    reanalyzed = refreshed * _plan_flops(model, again) / again.every if again.every else 0.0
+    reanalyzed = config.refreshed_states * _plan_flops(model, again) / again.every if again.every else 0.0
     return plan, (optim.updates_per_decision * update + reanalyzed)
 
 

@@ -27,12 +27,11 @@ def require_memory(config: TrainConfig, observation_dim: int, action_dim: int, d
     model, rows = config.model, min(config.replay.capacity, config.total_decisions + config.num_envs)
     replay = rows * row_bytes(observation_dim, action_dim)
     weights = 5 * _FLOAT * _parameters(model, observation_dim, action_dim)  # targets, gradient and two moments as well
-    refreshed = min(config.reanalyze.num_slices, config.optim.batch_size) if config.reanalyze.every else 0
     parts = {
         "replay.capacity": (replay, replay_device(config, device, replay)),
         "model.*": (weights, device),
         "planner.*": (_plan_bytes(model, config.planner, max(config.num_envs, config.eval_episodes)), device),
-        "reanalyze.*": (_plan_bytes(model, config.reanalyze, refreshed * config.loss.slice_len), device),
+        "reanalyze.*": (_plan_bytes(model, config.reanalyze, config.refreshed_states), device),
         "optim.batch_size": (_batch_bytes(config, observation_dim), device),
     }
     for name, (needed, where) in parts.items():

@@ -134,10 +134,9 @@ def _parts(
             agent.planner(states(*batch))
 
     def reanalyze() -> None:
-        if config.reanalyze.every:
-            rows = min(config.reanalyze.num_slices, config.optim.batch_size) * config.loss.slice_len
+        if config.refreshed_states:
             with set_exploration_type(ExplorationType.RANDOM):
-                agent.reanalyze_planner(states(rows).select("observation"))
+                agent.reanalyze_planner(states(config.refreshed_states).select("observation"))
 
     def evaluate() -> None:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
