@@ -50,6 +50,16 @@ def test_a_first_product_that_takes_a_minute_changes_nothing(monkeypatch):
     assert module._flops_per_second(config) == 2.0 * rows * width**2 / 0.001
 
 
+def test_threads_that_wait_for_each_other_on_a_busy_machine_change_nothing(monkeypatch):
+    config, threads = PRESETS["cpu"], [2]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    monkeypatch.setattr(module.timeit, "repeat", lambda *_, **__: [0.001 if threads[-1] == 1 else 0.02] * 10)
+    rows, width = min(config.planner.num_samples * config.model.num_dynamics, 2048), config.model.mlp_dim
+    assert module._flops_per_second(config) == 2.0 * rows * width**2 / 0.001
+    assert threads[-1] == 2  # as it was
+
+
 def test_an_estimate_draws_no_random_numbers():
     torch.manual_seed(0)
     before = torch.get_rng_state()

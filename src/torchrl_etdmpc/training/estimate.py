@@ -113,6 +113,13 @@ def _flops_per_second(config: TrainConfig) -> float:
     """Of matrix products such as the planner's, on this machine and now."""
     rows = min(config.planner.num_samples * config.model.num_dynamics, 2048)
     left, right = torch.ones(rows, config.model.mlp_dim), torch.ones(config.model.mlp_dim, config.model.mlp_dim)
-    # The first product of a process loads its library, which may take seconds.
-    seconds = min(timeit.repeat(lambda: left @ right, number=1, repeat=10))
-    return 2.0 * rows * config.model.mlp_dim**2 / seconds
+    # The first product of a process loads its library, which may take seconds. Where other processes are busy, threads
+    # wait for each other, many products in a row: one alone does not.
+    threads, seconds = torch.get_num_threads(), []
+    try:
+        for number in {threads, 1}:
+            torch.set_num_threads(number)
+            seconds += timeit.repeat(lambda: left @ right, number=1, repeat=10)
+    finally:
+        torch.set_num_threads(threads)
+    return 2.0 * rows * config.model.mlp_dim**2 / min(seconds)
