@@ -220,6 +220,24 @@ def test_a_damaged_file_is_named(tmp_path, part, how):
         ReplayJournal(tmp_path).load(make_buffer(), files)
 
 
+@pytest.mark.parametrize("lost", ["base", "change"])
+def test_rows_that_came_after_a_part_s_base_are_not_salvaged_without_their_targets(tmp_path, lost):
+    run, journal = Pipeline(make_buffer(90)), ReplayJournal(tmp_path)
+    run.write(24)  # parts of 30 rows
+    journal.save(run.buffer, version=run.version)
+    run.write(10)
+    files = journal.save(run.buffer, version=run.version)
+    base, change, _ = files["targets"]
+    assert [(entry["part"], entry["rows"]) for entry in files["targets"]] == [(0, 24), (0, 6), (1, 4)]
+    damage(tmp_path / {"base": base, "change": change}[lost]["file"], "missing")
+    copy = make_buffer(90)
+    assert len(ReplayJournal(tmp_path).salvage(copy, files)) == 1
+    wanted = run.buffer[30:34]
+    assert len(copy) == 4
+    for key in ("number", ("plan", "loc"), ("plan", "scale"), ("plan", "version")):
+        assert torch.equal(copy[:][key], wanted[key])
+
+
 def test_a_file_that_cannot_be_written_leaves_nothing_and_the_journal_as_it_was(tmp_path, monkeypatch):
     run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
     run.write(10)

@@ -219,7 +219,7 @@ class ReplayJournal:
                 targets = self._read_targets(entries, len(numbers), targets)
             except DamagedFileError as error:  # which rows of this part it holds is not known
                 faults.append(str(error))
-                readable &= (position < entries[0]["begin"]) | (position >= entries[0]["begin"] + entries[0]["rows"])
+                readable &= position // -(-capacity // PARTS) != part  # also those that came after its base
         begin, end = _longest(readable)
         if content is not None and end > begin:
             if targets is not None:
