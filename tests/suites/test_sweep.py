@@ -136,6 +136,27 @@ def test_a_process_that_is_killed_while_it_proposes_leaves_a_search_that_goes_on
     assert len([value for value in values if value is not None]) == 3
 
 
+def test_two_processes_that_share_a_search_close_each_trial_once(search, small, tmp_path):
+    first = Sweep(search(trials=2), "tuned", tmp_path)
+    (done,), (bad,) = first.propose(), first.propose()
+    second = Sweep(search(trials=2), "tuned", tmp_path)
+    assert second.runs() == [done, bad]
+    small.write_finished(done)
+    first._tell(1, None)
+    assert first.look() == []
+    assert second.look() == [bad]  # its process is to be stopped here as well
+    assert first.done and second.done
+    assert [trial.value for trial in study_of(tmp_path).trials] == [500.0, None]
+
+
+def test_two_processes_that_share_a_search_propose_no_more_trials_than_asked(search, tmp_path):
+    sweeps = [Sweep(search(trials=3), "tuned", tmp_path) for _ in range(2)]
+    for _ in range(4):
+        for sweep in sweeps:
+            sweep.propose()
+    assert len(study_of(tmp_path).trials) == 3
+
+
 def test_a_trial_below_the_median_of_five_ends_early(search, small, tmp_path):
     sweep = Sweep(search(trials=8, seeds=(1, 2)), "tuned", tmp_path)
     for _ in range(5):

@@ -25,7 +25,8 @@ class Sweep:
     experiment's tasks and seeds of the last return. After each evaluation that all runs of a trial have reached, their
     mean is compared with that of the finished trials at the same env step: below the median of five or more, the trial
     ends (Optuna's ``MedianPruner``). A trial that was running when the process was killed goes on under the same
-    settings; so does, in the next process, one of whose runs was given up.
+    settings; so does, in the next process, one of whose runs was given up. Processes that share the folder share the
+    trials: each follows those that were open when it began and those that it proposed itself.
 
     Args:
         experiment (Experiment): that holds the search.
@@ -72,8 +73,13 @@ class Sweep:
             return []
         import optuna
 
+        known = self._study.get_trials(deepcopy=False)
+        self._spent = sum(map(self._is_whole, known))  # another process may have proposed some
+        if self._spent >= self.search.trials:
+            return []
+
         # With one seed for all, a search that goes on after a kill would draw its first proposals again.
-        self._study.sampler = optuna.samplers.TPESampler(seed=len(self._study.get_trials(deepcopy=False)))
+        self._study.sampler = optuna.samplers.TPESampler(seed=len(known))
         trial = self._study.ask(_distributions(self.search))
         self._spent += 1
         return self._begin(trial.number, trial.params)
@@ -97,8 +103,15 @@ class Sweep:
 
     def look(self) -> list[Run]:
         """Notes how far the open trials are; returns the runs of those that end early."""
+        from optuna.trial import TrialState
+
         ended: list[Run] = []
+        trials = self._study.get_trials(deepcopy=False) if self._open else []
         for number, runs in list(self._open.items()):
+            if trials[number].state.is_finished():  # closed by another process
+                del self._open[number]
+                ended += runs if trials[number].state == TrialState.PRUNED else []
+                continue
             last = [read_progress(run) for run in runs]
             if all(entry.state == "finished" for entry in last):
                 self._tell(number, fmean(entry.latest_return for entry in last))
@@ -115,7 +128,7 @@ class Sweep:
         """Goes on with a trial of an earlier process; whether it counts as one."""
         import optuna
 
-        if set(trial.params) != set(self.search.space):  # killed while it was proposed
+        if not self._is_whole(trial):  # killed while it was proposed
             if not trial.state.is_finished():
                 self._tell(trial.number, math.nan)
             return False
@@ -126,6 +139,10 @@ class Sweep:
                 if last_verdict(run) is None and read_progress(run).state != "finished":
                     note(run, "pruned", BELOW_MEDIAN)
         return True
+
+    def _is_whole(self, trial: optuna.trial.FrozenTrial) -> bool:
+        """Whether every setting of the search was proposed."""
+        return set(trial.params) == set(self.search.space)
 
     def _begin(self, number: int, point: dict[str, Any]) -> list[Run]:
         self._keep(self._variant(number), {**self.search.settings, **point})
@@ -144,11 +161,11 @@ class Sweep:
         from optuna.trial import TrialState
 
         if value is None:
-            self._study.tell(number, state=TrialState.PRUNED)
+            self._study.tell(number, state=TrialState.PRUNED, skip_if_finished=True)
         elif math.isnan(value):
-            self._study.tell(number, state=TrialState.FAIL)
+            self._study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
         else:
-            self._study.tell(number, value)
+            self._study.tell(number, value, skip_if_finished=True)
         self._open.pop(number, None)
 
     def _should_be_pruned(self, number: int, runs: list[Run]) -> bool:
