@@ -254,6 +254,16 @@ def test_a_search_adds_its_trials_to_the_experiment(call, mine, trained, tmp_pat
     assert "6 runs: 6 finished" in out
 
 
+def test_a_search_goes_on_by_its_folder_alone(call, mine, monkeypatch):
+    pytest.importorskip("optuna")
+    monkeypatch.setattr(suite, "run_locally", lambda queue, **places: queue.next() is None)
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 1}
+    for begin in (f"experiment={mine(variants={'tuned': search}, base=None)}", None):
+        message, out = call(*filter(None, (begin, "runs_dir=here", "seeds=1")))
+        assert message == 75
+        assert "1 runs: 1 waiting" in out
+
+
 def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
     call(f"experiment={mine()}", "seeds=1", "runs_dir=here")
     message, out = call(

@@ -34,6 +34,14 @@ def test_the_longest_begin_first(queue_of):
     assert not queue.left
 
 
+def test_a_run_that_is_named_twice_is_handed_out_once(small, tmp_path):
+    runs = small.experiment(seeds=(1, 2)).runs(tmp_path)
+    queue = RunQueue([*runs, *small.experiment(seeds=(2,)).runs(tmp_path), runs[0]])
+    assert [queue.next().seed for _ in range(2)] == [1, 2]
+    assert queue.next() is None
+    assert queue.runs == runs
+
+
 def test_finished_and_pruned_runs_are_not_handed_out(queue_of, small, tmp_path):
     finished, pruned, _ = small.experiment(seeds=(1, 2, 3)).runs(tmp_path)
     small.write_finished(finished)

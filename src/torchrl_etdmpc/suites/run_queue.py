@@ -155,7 +155,8 @@ class RunQueue:
 
     def _add(self, runs: Iterable[Run]) -> None:
         known = {run.name for run in self.runs}
-        new = [run for run in runs if run.name not in known]
+        # A trial that is open is a variant of the folder's experiment as well.
+        new = [run for name, run in {run.name: run for run in runs}.items() if name not in known]
         self.runs += new
         self._waiting += [run for run in new if read_progress(run).state not in ("finished", "pruned")]
         self._waiting.sort(key=work, reverse=True)
