@@ -127,6 +127,18 @@ def test_a_verdict_holds_until_the_next_process_begins(small, tmp_path, monkeypa
     assert last_verdict(run) is None
 
 
+def test_a_verdict_stands_behind_a_line_that_a_killed_process_left_open(small, tmp_path, monkeypatch):
+    (run,) = small.experiment().runs(tmp_path)
+    run.path.mkdir(parents=True)
+    log_file(run).write_text("suite: begun\ncompiling: 40%")
+    note(run, "failed", "exit code 134")
+    assert last_verdict(run) == ("failed", "exit code 134")
+    log_file(run).write_text("compiling: 40%")
+    monkeypatch.setattr(attempt, "command", lambda run: [sys.executable, "-S", "-c", ""])
+    start(run).wait()
+    assert small.log_of(run) == ["compiling: 40%", "suite: begun"]
+
+
 def test_a_verdict_that_cannot_be_written_ends_nothing(small, tmp_path):
     (run,) = small.experiment().runs(tmp_path)
     run.path.parent.mkdir(parents=True)

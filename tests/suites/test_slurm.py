@@ -149,6 +149,15 @@ def test_a_run_that_fails_is_tried_again_and_then_named(stand_in_script, submit,
     assert requeued(tmp_path) == []
 
 
+def test_what_the_script_says_stands_behind_a_line_that_was_left_open(stand_in_script, submit, small):
+    runs, script = stand_in_script({"": [("fail", 0)]}, retries=0)
+    runs[0].path.mkdir(parents=True, exist_ok=True)
+    log_file(runs[0]).write_text("compiling: 40%")
+    assert submit(script, 0).wait() == 1
+    assert small.log_of(runs[0])[:2] == ["compiling: 40%", "suite: begun"]
+    assert last_verdict(runs[0]) == ("failed", "the simulator is gone")
+
+
 def test_a_run_that_is_killed_is_tried_again(stand_in_script, submit, small):
     runs, script = stand_in_script({"": [("kill", 100), ("fail", 100), ("finish", 400)]})
     assert submit(script, 0).wait() == 0

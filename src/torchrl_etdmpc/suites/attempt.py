@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.dotted import flat
@@ -68,8 +68,8 @@ def start(run: Run, *, threads: int | None = None, gpu: str | None = None) -> su
     if gpu is not None:
         environment["CUDA_VISIBLE_DEVICES"] = gpu
     run.path.mkdir(parents=True, exist_ok=True)
-    with open(log_file(run), "ab") as log:
-        log.write(f"{BEGUN}\n".encode())
+    with open(log_file(run), "a+b") as log:
+        log.write(f"{_line_end(log)}{BEGUN}\n".encode())
         log.flush()
         return subprocess.Popen(
             command(run, **more),
@@ -102,8 +102,8 @@ def note(run: Run, verdict: Verdict, why: str) -> None:
     """Writes into the run's log what was decided about it, where :func:`last_verdict` finds it; not on a full disk."""
     with contextlib.suppress(OSError):
         run.path.mkdir(parents=True, exist_ok=True)
-        with open(log_file(run), "a", encoding="utf-8") as log:
-            log.write(f"{_VERDICTS[verdict]}{why}\n")
+        with open(log_file(run), "a+b") as log:
+            log.write(f"{_line_end(log)}{_VERDICTS[verdict]}{why}\n".encode())
 
 
 def last_verdict(run: Run) -> tuple[Verdict, str] | None:
@@ -113,6 +113,13 @@ def last_verdict(run: Run) -> tuple[Verdict, str] | None:
         if last.startswith(beginning):
             return verdict, last.removeprefix(beginning)
     return None
+
+
+def _line_end(log: BinaryIO) -> str:
+    """What ends the last line of a log, which a process that was killed may have left open."""
+    size = log.seek(0, os.SEEK_END)
+    log.seek(max(size - 1, 0))
+    return "" if log.read(1) in (b"\n", b"") else "\n"
 
 
 def _last_line(file: Path) -> str:

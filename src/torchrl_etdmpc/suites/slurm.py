@@ -28,10 +28,14 @@ child=
 trap 'signal=USR1; [ -n "$child" ] && kill -USR1 "$child" 2>/dev/null' USR1
 trap 'signal=TERM; [ -n "$child" ] && kill -TERM "$child" 2>/dev/null' TERM  # cancelled: it is saved, and stays away
 export OMP_NUM_THREADS="${{SLURM_CPUS_PER_TASK:-1}}"
+say() {{  # in a line of its own: a process that was killed may have left one open
+    [ -z "$(tail -c 1 "$log" 2> /dev/null)" ] || echo >> "$log"
+    echo "$1" >> "$log"
+}}
 
 tries=0
 while :; do
-    echo "{begun}" >> "$log"
+    say "{begun}"
     "$@" >> "$log" 2>&1 &
     child=$!
     code=0
@@ -50,7 +54,7 @@ while :; do
     tries=$((tries + 1))
     [ "$tries" -gt {retries} ] && break
 done
-echo "{failed}$(tail -n 1 "$log" | sed 's/^error: //')" >> "$log"
+say "{failed}$(tail -n 1 "$log" | sed 's/^error: //')"
 exit "$code"
 """
 
