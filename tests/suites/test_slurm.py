@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shlex
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_etdmpc.suites import write_slurm_script
+from torchrl_etdmpc.suites import slurm, write_slurm_script
 from torchrl_etdmpc.suites.attempt import last_verdict, log_file
 
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
@@ -147,6 +148,40 @@ def test_a_run_that_fails_is_tried_again_and_then_named(stand_in_script, submit,
     assert small.tries(runs[0]) == 3
     assert last_verdict(runs[0]) == ("failed", "the simulator is gone")
     assert requeued(tmp_path) == []
+
+
+def test_a_run_that_another_process_trains_is_waited_for(stand_in_script, submit, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(slurm, "_LOOK_AGAIN_S", 0.05)
+    runs, script = stand_in_script({}, retries=0)
+    runs[0].path.mkdir(parents=True, exist_ok=True)
+    with open(runs[0].path / ".lock", "w") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)
+        process = submit(script, 0)
+        deadline = time.monotonic() + 30
+        while not log_file(runs[0]).exists() or small.log_of(runs[0]).count("suite: begun") < 3:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert process.poll() is None and small.tries(runs[0]) == 0
+    assert process.wait(30) == 0
+    assert small.tries(runs[0]) == 1
+    assert requeued(tmp_path) == []
+
+
+def test_a_job_that_waits_for_another_process_leaves_when_it_is_told(stand_in_script, submit, small, tmp_path):
+    runs, script = stand_in_script({}, retries=0)
+    runs[0].path.mkdir(parents=True, exist_ok=True)
+    with open(runs[0].path / ".lock", "w") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)
+        process = submit(script, 0)
+        deadline = time.monotonic() + 30
+        while not log_file(runs[0]).exists() or "in use" not in log_file(runs[0]).read_text():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGUSR1)
+        assert process.wait(30) == 75
+    assert requeued(tmp_path) == ["requeue 71"]
+    assert last_verdict(runs[0]) is None
 
 
 def test_what_the_script_says_stands_behind_a_line_that_was_left_open(stand_in_script, submit, small):

@@ -21,6 +21,8 @@ Verdict = Literal["failed", "pruned"]
 BEGUN = "suite: begun"
 BELOW_MEDIAN = "below the median of the trials before it"
 FAILED = "suite: failed: "
+IN_USE = "is in use by another process"
+"""What a process says that finds the directory locked."""
 _VERDICTS: dict[Verdict, str] = {"failed": FAILED, "pruned": "suite: pruned: "}
 _TAIL_BYTES = 16_384
 
@@ -89,7 +91,7 @@ def end(run: Run, code: int) -> tuple[End, str]:
     """
     directory = RunDirectory(run.path)
     last = _last_line(log_file(run))
-    if directory.in_use or "is in use by another process" in last:
+    if directory.in_use or IN_USE in last:
         return "elsewhere", "another process trains it"
     if code == 0 and directory.finished:
         return "finished", ""

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_etdmpc.runs.files import write_whole
-from torchrl_etdmpc.suites.attempt import BEGUN, FAILED, command, log_file
+from torchrl_etdmpc.suites.attempt import BEGUN, FAILED, IN_USE, command, log_file
 from torchrl_etdmpc.suites.experiment import Run
 from torchrl_etdmpc.training import EXIT_CODE
 
+_LOOK_AGAIN_S = 30  # at a run that another process has
 # SLURM sends the signal to the script alone (B:), which passes it on; `wait` returns when a trap has run, so it is
 # asked again until the process is gone.
 _BODY = """\
@@ -46,6 +47,13 @@ while :; do
     done
     child=
     [ "$code" -eq 0 ] && exit 0
+    case "$(tail -n 1 "$log")" in *"{in_use}"*)  # it is waited for
+        if [ -z "$signal" ]; then
+            sleep {pause} &
+            wait "$!"
+        fi
+        [ -z "$signal" ] && continue ;;
+    esac
     [ "$signal" = TERM ] && exit {code}
     if [ "$signal" = USR1 ] || [ "$code" -eq {code} ]; then
         scontrol requeue "$SLURM_JOB_ID"
@@ -125,6 +133,8 @@ def write_slurm_script(
         commands=shlex.quote(str(commands)),
         begun=BEGUN,
         failed=FAILED,
+        in_use=IN_USE,
+        pause=_LOOK_AGAIN_S,
         retries=retries,
         code=EXIT_CODE,
     )
