@@ -202,6 +202,22 @@ def test_an_experiment_is_trained_told_and_grown(call, mine, trained, tmp_path):
     assert out.splitlines()[-1] == "4 runs: 4 finished"
 
 
+def test_two_commands_that_begin_at_once_both_add_to_the_experiment(call, mine, trained, tmp_path, monkeypatch):
+    check, calls = suite._require_parts, []
+
+    def while_the_other_begins(runs) -> None:
+        check(runs)
+        calls.append(runs)
+        if len(calls) == 1:
+            call(f"experiment={mine()}", "runs_dir=here", "variants=b", "seeds=[2]")
+
+    monkeypatch.setattr(suite, "_require_parts", while_the_other_begins)
+    message, _ = call(f"experiment={mine()}", "runs_dir=here", "variants=a", "seeds=[1]")
+    assert message == 0
+    stored = read_experiment(tmp_path / "here" / "experiment.yaml")
+    assert (sorted(stored.variants), sorted(stored.seeds)) == (["a", "b"], [1, 2])
+
+
 def test_the_base_stays_when_a_command_trains_other_variants(call, mine, trained, tmp_path):
     call(f"experiment={mine(base='a')}", "runs_dir=here")
     call(f"experiment={mine(base='a')}", "runs_dir=here", "variants=b")

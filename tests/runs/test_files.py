@@ -14,6 +14,7 @@ import torch
 
 from torchrl_etdmpc.runs import DamagedFileError
 from torchrl_etdmpc.runs.files import (
+    alone,
     link,
     load_tensors,
     read_tensors,
@@ -129,6 +130,26 @@ def test_partial_files_go_and_other_hidden_files_and_folders_stay(tmp_path):
     (tmp_path / ".0001.partial").mkdir()
     remove_partial_files(tmp_path)
     assert names(tmp_path) == {".lock", "partial.pt", ".0001.partial"}
+
+
+def test_processes_change_a_file_one_after_the_other(tmp_path, in_copy):
+    file, lock = tmp_path / "count", tmp_path / ".lock"
+    file.write_text("0")
+
+    def count_on() -> None:
+        for _ in range(50):
+            with alone(lock):
+                write_whole(file, str(int(file.read_text()) + 1))
+
+    def beside_a_copy() -> None:
+        child = os.fork()
+        count_on()
+        if child == 0:
+            os._exit(0)
+        os.waitpid(child, 0)
+
+    assert in_copy(beside_a_copy) == 0
+    assert file.read_text() == "100"
 
 
 def test_tensors_come_back_and_the_checksum_is_the_file_s(tmp_path):

@@ -16,6 +16,7 @@ from torchrl_etdmpc.commands.command_line import nearest, one_line_errors
 from torchrl_etdmpc.commands.settings_help import Setting, help_text, settings_of
 from torchrl_etdmpc.envs import import_task
 from torchrl_etdmpc.runs import RunDirectory, console
+from torchrl_etdmpc.runs.files import alone
 from torchrl_etdmpc.suites import (
     Experiment,
     Run,
@@ -42,6 +43,7 @@ from torchrl_etdmpc.training import (
 )
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiments"
+_FILE, _LOCK = "experiment.yaml", ".experiment.lock"
 WHAT = """Trains every run of an experiment: tasks x seeds x variants.
 
   suite experiment=NAME               all runs, each gone on with wherever it is; finished ones cost nothing
@@ -130,8 +132,7 @@ def main() -> None:
     folder = Path(config.runs_dir or f"runs/{asked.name}").expanduser().absolute()
     if RunDirectory(folder).holds_a_run:
         raise ValueError(f"runs_dir={folder} is the directory of a run; choose a folder for many of them.")
-    file = folder / "experiment.yaml"
-    stored = read_experiment(file) if file.exists() else None
+    stored = _stored(folder)
     _import_own_code(config, settings, [asked] if stored is None else [asked, stored])
     if words == ["status"]:
         if stored is None:
@@ -148,7 +149,9 @@ def main() -> None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_experiment(whole, file)
+        with alone(folder / _LOCK):
+            stored = _stored(folder)  # by now; another command may have added to it
+            write_experiment(asked if stored is None else extended(stored, asked, folder), folder / _FILE)
     except OSError as error:
         raise OSError(
             f"runs_dir={folder} cannot be written ({error.strerror}); choose a folder that you can write to."
@@ -157,6 +160,12 @@ def main() -> None:
         _write_for_slurm(config, asked, runs, folder)
         return
     sys.exit(_carry_out(config, asked, runs, folder))
+
+
+def _stored(folder: Path) -> Experiment | None:
+    """What the folder was begun with, if it was."""
+    file = folder / _FILE
+    return read_experiment(file) if file.exists() else None
 
 
 def _require_differences(experiment: Experiment, folder: Path) -> None:
@@ -186,12 +195,13 @@ def _require_parts(runs: Iterable[Run]) -> None:
 
 def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: Path) -> int:
     """Trains until nothing is left, and says where everything is; the command's exit code."""
-    file = folder / "experiment.yaml"
+    file = folder / _FILE
 
     def keep(variant: str, settings: dict[str, Any]) -> None:
-        known = read_experiment(file)
-        if variant not in known.variants:
-            write_experiment(dataclasses.replace(known, variants={**known.variants, variant: settings}), file)
+        with alone(folder / _LOCK):
+            known = read_experiment(file)
+            if variant not in known.variants:
+                write_experiment(dataclasses.replace(known, variants={**known.variants, variant: settings}), file)
 
     sweeps = [Sweep(asked, name, folder, keep) for name in asked.searches]
     runs = [*runs, *(run for sweep in sweeps for run in sweep.runs())]
@@ -274,7 +284,7 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
         else:
             raise ValueError(f"unknown setting {name}; {nearest(name, [*own, *training])}")
     if not values.get("experiment") and values.get("runs_dir"):
-        file = Path(values["runs_dir"]).expanduser() / "experiment.yaml"
+        file = Path(values["runs_dir"]).expanduser() / _FILE
         if not file.is_file():
             raise FileNotFoundError(f"runs_dir={file.parent} holds no experiment; begin it with experiment=NAME.")
         values["experiment"] = str(file)

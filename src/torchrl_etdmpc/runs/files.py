@@ -11,7 +11,7 @@ import stat
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,26 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview | str) -> No
     """Writes a file that survives a power cut or is not there."""
     with replacing(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def alone(lock: Path) -> Iterator[None]:
+    """Other processes that ask for the same file wait for the block, which reads a file, changes it and writes it.
+
+    The file stays there, empty. Nobody waits where there are no system locks.
+
+    >>> with alone(Path(tempfile.mkdtemp()) / ".lock"):
+    ...     pass
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    with open(lock, "ab") as file:
+        with suppress(OSError):  # a file system without locks
+            fcntl.lockf(file, fcntl.LOCK_EX)
+        yield
 
 
 def make_folder(folder: Path) -> None:
