@@ -438,6 +438,7 @@ def test_slurm_cannot_search(call, mine):
     search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 2}
     code, _ = call(f"experiment={mine(variants={'tuned': search})}", "engine=slurm", "runs_dir=here")
     assert code == "error: engine=slurm cannot search: the next trial depends on those before it; use local or ray."
+    assert not Path("here").exists()
 
 
 @pytest.mark.parametrize(("module", "package"), [("ray", "ray>=2.60,<3"), ("optuna", "optuna>=5,<6")])

@@ -147,6 +147,8 @@ def main() -> None:
     if config.dry_run:
         print(_plan(asked, runs))
         return
+    if config.engine == "slurm" and asked.searches:
+        raise ValueError("engine=slurm cannot search: the next trial depends on those before it; use local or ray.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with alone(folder / _LOCK):
@@ -228,8 +230,6 @@ def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: 
 
 
 def _write_for_slurm(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: Path) -> None:
-    if asked.searches:
-        raise ValueError("engine=slurm cannot search: the next trial depends on those before it; use local or ray.")
     progress = RunIndex(folder / "index.sqlite").read(runs)
     left = [run for run, entry in zip(runs, progress, strict=True) if entry.state != "finished"]
     if not left:
