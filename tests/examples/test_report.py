@@ -136,6 +136,7 @@ def test_a_path_that_does_not_exist_is_one_line_on_stderr_of_the_real_command(ru
 def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_interrupt(tmp_path):
     row = lambda steps, value: f"{steps},{steps // 2},7,1.0,{value},0.5,10\n"  # noqa: E731
     run = make_run("runs/one", text=HEADER + row(0, 1.0) + row(10_000, 5.0))
+    (run / "summary.json").unlink()
     options = ("--budget", "20000", "--grid-step", "10000", "--reference", make_baseline(), "--watch", "0.5")
     process = start("runs", *options)
 
@@ -161,6 +162,10 @@ def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_inter
             file.write(rest)
         assert "up to 20,000 env steps" in wait_for_reports(3)[2]
         assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 77.5
+        assert "not finished, ends at 20,000 env steps" in Path("report", "index.md").read_text()
+        (run / "summary.json").write_text("{}")  # written after the last row
+        assert "unfinished" not in wait_for_reports(4)[3]
+        assert "not finished" not in Path("report", "index.md").read_text()
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 130

@@ -328,10 +328,11 @@ def choose_base(
 
 
 def stamp(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
-    """Changes when an evaluation is added or a run appears."""
+    """Changes when an evaluation is added, or a run appears or is finished."""
     from torchrl_etdmpc.analysis import find_runs
 
-    files = [RunDirectory(run).eval for run in find_runs(path for _, path in map(named, arguments.runs))]
+    runs = [RunDirectory(run) for run in find_runs(path for _, path in map(named, arguments.runs))]
+    files = [file for run in runs for file in (run.eval, run.summary) if file.exists()]
     return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 
 
