@@ -215,6 +215,17 @@ def test_returns_at_the_budget_may_lie_on_the_line_from_the_untrained_agent_if_a
         assert cell(comparison.finals, "late", "walker-walk")["mean"] == pytest.approx(mean, nan_ok=True)
 
 
+def test_a_mean_of_which_a_seed_lies_between_two_evaluations_is_not_called_evaluated():
+    other = seed_curves("ours", ours, seeds=(4,), steps=(0, 40_000, 120_000, 160_000, 240_000))
+    comparison = run(pd.concat([OURS, other]), steps=(50_000, 200_000))
+    kinds = comparison.returns.groupby(["method", "env_steps"])["kind"].agg(set)
+    for step in (50_000, 200_000):
+        assert (kinds["ours", step], kinds["BMPC", step]) == ({"interpolated"}, {"evaluated"})
+    assert any(note.startswith("ours: not evaluated at 200,000 env steps; values there") for note in comparison.notes)
+    alone = run(steps=(50_000, 200_000)).returns
+    assert set(alone["kind"]) == {"evaluated"}
+
+
 def test_the_evaluation_of_the_untrained_agent_makes_no_evaluated_method():
     late = seed_curves("late", ours, steps=(0, 300_000))
     for budget, found in ((200_000, []), (300_000, ["late"])):

@@ -23,7 +23,7 @@ from torchrl_etdmpc.analysis.statistics import (
     seed_estimates,
     shared_grid,
 )
-from torchrl_etdmpc.analysis.steps import STEPS, no_points, returns_at
+from torchrl_etdmpc.analysis.steps import STEPS, evaluated_cells, no_points, returns_at
 from torchrl_etdmpc.analysis.tables import AGGREGATE
 
 
@@ -170,6 +170,7 @@ def compare(
     tasks = tuple(tasks or benchmark.tasks)
     budget = budget or benchmark.budget
     estimates = merge_estimates(seed_curves if from_zero else on_common_steps(seed_curves), means)
+    evaluated = evaluated_cells(estimates, merge_estimates(seed_curves, means))
     points = no_points() if points is None else points
     points = points[points["task"].isin(tasks) & (points["env_steps"] <= budget)].reset_index(drop=True)
     constants = normalisers(estimates[estimates["task"].isin(benchmark.tasks)], benchmark.budget)
@@ -193,12 +194,12 @@ def compare(
         "areas": areas.reset_index(drop=True),
         "finals": finals.reset_index(drop=True),
         "points": points,
-        "returns": returns_at(estimates, points, steps=within, tasks=tasks, methods=methods),
+        "returns": returns_at(estimates, points, steps=within, tasks=tasks, methods=methods, evaluated=evaluated),
         "paired": compare_paired(
             seed_curves, base=base or "", variants=variants, env_steps=budget, tasks=tasks, constants=constants
         ),
     }
-    known = (seed_curves, estimates, constants, tasks, methods, budget, tables["areas"], tables["finals"])
+    known = (seed_curves, estimates, evaluated, constants, tasks, methods, budget, tables["areas"], tables["finals"])
     notes = (*_notes(*known), *notes)
     return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **tables)
 
@@ -248,6 +249,7 @@ def _aggregate_rows(table: pd.DataFrame, tasks: tuple[str, ...], column: str) ->
 def _notes(
     seed_curves: pd.DataFrame,
     estimates: pd.DataFrame,
+    evaluated: set[tuple[str, str, float]],
     constants: pd.Series,
     tasks: tuple[str, ...],
     methods: tuple[str, ...],
@@ -271,9 +273,8 @@ def _notes(
     ]
     if unknown:
         yield f"No interval of the AUC for {', '.join(unknown)}: it needs the curves of at least two seeds."
-    there = set(zip(*(estimates[estimates["env_steps"] == budget][name] for name in ("method", "task")), strict=True))
     known = finals[(finals["task"] != AGGREGATE) & finals["mean"].notna()]
-    between = [row.method for row in known.itertuples() if (row.method, row.task) not in there]
+    between = [row.method for row in known.itertuples() if (row.method, row.task, budget) not in evaluated]
     if between:
         yield (
             f"{', '.join(dict.fromkeys(between))}: not evaluated at {budget:,} env steps; values there lie on the "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pandas as pd
@@ -36,6 +36,7 @@ def returns_at(
     steps: Sequence[float],
     tasks: Sequence[str],
     methods: Sequence[str],
+    evaluated: Collection[tuple[str, str, float]] | None = None,
 ) -> pd.DataFrame:
     """Mean returns at fixed steps by task, and their mean over the tasks that have a value.
 
@@ -46,6 +47,8 @@ def returns_at(
         steps (sequence of float): env steps.
         tasks (sequence of str): the compared tasks.
         methods (sequence of str): of the curves; those of the points come behind them.
+        evaluated (collection of tuple, optional): method, task and env steps of the estimates in which nothing is
+            interpolated, see :func:`evaluated_cells`. Default: all.
 
     Returns:
         DataFrame: a row for every value that exists, ``env_steps, method, task, mean, standard_error, lower, upper,
@@ -66,7 +69,7 @@ def returns_at(
     grid = np.array(sorted(steps), dtype=float)
     chosen = estimates[estimates["method"].isin(methods) & estimates["task"].isin(tasks)]
     curves = interpolate(chosen, grid).dropna(subset="mean")
-    there = set(zip(chosen["method"], chosen["task"], chosen["env_steps"], strict=True))
+    there = evaluated_cells(chosen, chosen) if evaluated is None else evaluated
     here = zip(curves["method"], curves["task"], curves["env_steps"], strict=True)
     curves = curves.assign(kind=["evaluated" if cell in there else "interpolated" for cell in here])
     quoted = points[points["task"].isin(tasks) & points["env_steps"].isin(grid)]
@@ -85,6 +88,20 @@ def returns_at(
     )
     table = pd.concat([table, means.reset_index().assign(task=MEAN)] if len(table) else [table], ignore_index=True)
     return add_interval(table).reindex(columns=list(_COLUMNS))
+
+
+def evaluated_cells(estimates: pd.DataFrame, evaluations: pd.DataFrame) -> set[tuple[str, str, float]]:
+    """Method, task and env steps of the estimates that are of as many seeds as were evaluated there.
+
+    Args:
+        estimates (DataFrame): of seeds that may have been brought to common steps.
+        evaluations (DataFrame): estimates of the seeds' own evaluations.
+    """
+    cells, there = (
+        dict(zip(zip(table["method"], table["task"], table["env_steps"], strict=True), table["seeds"], strict=True))
+        for table in (estimates, evaluations)
+    )
+    return {cell for cell, seeds in cells.items() if cell in there and not there[cell] < seeds}
 
 
 def step_table(returns: pd.DataFrame, step: float, *, tasks: Sequence[str], methods: Sequence[str]) -> str:
