@@ -207,6 +207,13 @@ def test_quoted_points_count_up_to_a_smaller_budget_and_variants_are_paired_ther
     assert differences[[*TASKS]].tolist() == pytest.approx([100_000] * 2)
 
 
+def test_a_variant_without_a_pair_is_named():
+    alone = seed_curves("alone", ours, seeds=(7, 8))
+    comparison = run(pd.concat([OURS, alone]), base="ours", variants=["alone"])
+    assert comparison.paired.empty
+    assert "alone shares no task and seed with ours: not paired." in comparison.notes
+
+
 def test_returns_at_the_budget_may_lie_on_the_line_from_the_untrained_agent_if_asked_for():
     late = seed_curves("late", lambda seed, task, step: float(step), steps=(0, 150_000))
     expected = {False: np.nan, True: 100_000}

@@ -199,6 +199,8 @@ def compare(
             seed_curves, base=base or "", variants=variants, env_steps=budget, tasks=tasks, constants=constants
         ),
     }
+    paired = set(tables["paired"]["variant"])
+    notes += [f"{name} shares no task and seed with {base}: not paired." for name in variants if name not in paired]
     known = (seed_curves, estimates, evaluated, constants, tasks, methods, budget, tables["areas"], tables["finals"])
     notes = (*_notes(*known), *notes)
     return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **tables)
