@@ -10,8 +10,10 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.modules import CEMPlanner
 
-from torchrl_etdmpc.inspector import Trace, load_trace, trace_plan
+from torchrl_etdmpc.inspector import Trace, load_trace, trace_plan, trace_torchrl_planner
 from torchrl_etdmpc.inspector.inspection import Strip
 from torchrl_etdmpc.inspector.saved_page import facts_of, picture, setting_rows, write_page
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
@@ -106,13 +108,11 @@ def test_a_gain_by_other_value_heads_than_the_policy_s_says_so():
     assert float(facts_of(make())["gain"]) is not None
 
 
-def test_a_clicked_candidate_has_the_columns_of_its_own_heads(tmp_path):
-    """The script on a stand-in of the browser: a candidate of an action-value critic has two heads, its choice five."""
+def clicked(folder, candidate: int) -> tuple[list[str] | None, dict]:
+    """Columns of the table before a click, and the table after it: the script on a stand-in of the browser."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("needs node: apt-get install nodejs")
-    trace = action_values(eval_first_action="mean")
-    folder = write_page(tmp_path / "page", trace).parent
     script = """
         const fs = require('fs'), drawn = {};
         let click;
@@ -122,16 +122,33 @@ def test_a_clicked_candidate_has_the_columns_of_its_own_heads(tmp_path):
         for (const name of ['data.js', 'saved_page.js']) {
             require('vm').runInThisContext(fs.readFileSync(process.argv[1] + '/' + name, 'utf8'));
         }
-        const before = drawn['return_table-a'][0].x;
-        click({points: [{customdata: 6}]});
-        console.log(JSON.stringify([before, drawn['return_table-a'][0]]));
+        const before = drawn['return_table-a'][0];
+        click({points: [{customdata: Number(process.argv[2])}]});
+        console.log(JSON.stringify([before ? before.x : null, drawn['return_table-a'][0]]));
     """
-    run = subprocess.run([node, "-e", script, str(folder)], capture_output=True, text=True, check=False)
+    run = subprocess.run([node, "-e", script, str(folder), str(candidate)], capture_output=True, text=True, check=False)
     assert run.stderr == ""
-    before, table = json.loads(run.stdout)
+    return json.loads(run.stdout)
+
+
+def test_a_clicked_candidate_has_the_columns_of_its_own_heads(tmp_path):
+    """A candidate of an action-value critic has two heads, its choice five."""
+    trace = action_values(eval_first_action="mean")
+    before, table = clicked(write_page(tmp_path / "page", trace).parent, 6)
     assert before == ["1.1", "1.2", "1.3", "1.4", "1.5"]
     assert table["x"] == ["1.1", "1.2"]
     np.testing.assert_allclose(table["z"], trace["returns"][-1, 6].reshape(1, 2), rtol=1e-6)
+
+
+def test_a_candidate_has_its_table_also_where_the_chosen_sequence_has_none(tmp_path):
+    env = LatentEnv(LineWorld())
+    planner = CEMPlanner(env, planning_horizon=3, optim_steps=2, num_candidates=16, top_k=4)
+    state = env.reset(TensorDict({"observation": torch.tensor([0.5])}, []))
+    trace = trace_torchrl_planner(planner, state)
+    before, table = clicked(write_page(tmp_path / "page", trace).parent, 5)
+    assert before is None
+    assert (table["x"], table["y"]) == (["1.1"], ["3"])
+    np.testing.assert_allclose(table["z"], trace["returns"][-1, 5].reshape(1, 1), rtol=1e-6)
 
 
 def test_a_plan_that_fell_back_has_a_page(tmp_path):

@@ -200,7 +200,9 @@ def _side(trace: Trace) -> dict[str, Any]:
     returns = trace.get("returns")
     if returns is not None:
         data = base64.b64encode(np.ascontiguousarray(returns, dtype="<f4").tobytes()).decode()
-        side["returns"] = {"shape": list(returns.shape), "data": data}
+        # A candidate's table, to be filled: that of the chosen sequence may have other heads, or not be there.
+        table = _plain(figures.plain(figures.return_table)(trace, candidate=0))
+        side["returns"] = {"shape": list(returns.shape), "data": data, "table": table}
     return side
 
 

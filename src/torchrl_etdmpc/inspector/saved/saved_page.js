@@ -19,9 +19,10 @@
 
   function draw(side, name) {
     var div = document.getElementById(name + "-" + "ab"[side]);
-    var figure = copy(figureOf(side, name));
-    var clicked = state.candidate !== null && state.side === side;
-    if (name === "return_table" && clicked) { fill(figure, side); }
+    var clicked = state.candidate !== null && state.side === side, packed = INSPECTION.sides[side].returns;
+    var filled = name === "return_table" && clicked && packed;
+    var figure = copy(filled ? packed.table : figureOf(side, name));
+    if (filled) { fill(figure, side); }
     Plotly.react(div, figure.data, figure.layout, config).then(function () {
       if (name === "latent_plane" && clicked) { moveRing(div, state.candidate); }
     });
@@ -30,7 +31,6 @@
   // The return table of a candidate: rows of depths, columns of dynamics and value heads.
   function fill(figure, side) {
     var packed = INSPECTION.sides[side].returns;
-    if (!packed) { return; }
     packed.numbers = packed.numbers || numbers(packed.data);
     var shape = packed.shape, columns = shape[3] * shape[4], rows = [];
     var iteration = Math.min(state.iteration, shape[0] - 1);
@@ -39,9 +39,6 @@
       rows.push(Array.from(packed.numbers.subarray(begin + row * columns, begin + (row + 1) * columns)));
     }
     figure.data[0].z = rows;
-    figure.data[0].x = rows[0].map(function (_, at) { // what was searched with, fewer heads than judge the rest
-      return (Math.floor(at / shape[4]) + 1) + "." + (at % shape[4] + 1);
-    });
     var score = INSPECTION.sides[side].scores[iteration][state.candidate];
     figure.layout.title = { text: "candidate " + state.candidate + ", score " + (score === null ? "not finite" : score.toFixed(3)), font: { size: 13 } };
   }
