@@ -27,6 +27,14 @@ def test_what_is_measured_seldom_has_a_mean_of_its_own():
     assert means.means() == {"loss": 1.5, "age": 5}
 
 
+def test_a_metric_that_comes_in_other_company_is_one_metric():
+    means = IntervalMeans()
+    means.add({"loss": torch.tensor(0.0), "policy_kl": torch.tensor(1.0)})
+    for number in (4.0, 8.0):
+        means.add({"loss": torch.tensor(number)})
+    assert means.means() == {"loss": 4, "policy_kl": 1}
+
+
 def test_many_small_values_are_added_exactly_enough():
     means = IntervalMeans()
     for _ in range(10_000):

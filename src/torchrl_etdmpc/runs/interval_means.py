@@ -37,11 +37,12 @@ class IntervalMeans:
 
     def means(self) -> dict[str, float]:
         """The mean of each metric since :meth:`clear`."""
-        return {
-            name: mean
-            for names, total in self._sums.items()
-            for name, mean in zip(names, (total / self._counts[names]).tolist(), strict=True)
-        }
+        sums: dict[str, tuple[float, int]] = {}
+        for names, total in self._sums.items():
+            for name, added in zip(names, total.tolist(), strict=True):
+                so_far, count = sums.get(name, (0.0, 0))  # it may have come in other company before
+                sums[name] = so_far + added, count + self._counts[names]
+        return {name: total / count for name, (total, count) in sums.items()}
 
     def clear(self) -> None:
         """Begins a new interval."""
