@@ -6,6 +6,7 @@ import os
 import pickle
 import stat
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
 
@@ -130,6 +131,19 @@ def test_partial_files_go_and_other_hidden_files_and_folders_stay(tmp_path):
     (tmp_path / ".0001.partial").mkdir()
     remove_partial_files(tmp_path)
     assert names(tmp_path) == {".lock", "partial.pt", ".0001.partial"}
+
+
+def test_threads_that_write_one_file_leave_what_one_of_them_wrote(tmp_path):
+    path, contents = tmp_path / "file", [letter * 100_000 for letter in ("a", "b", "c")]
+
+    def write(content: str) -> None:
+        for _ in range(20):
+            write_whole(path, content)
+
+    with ThreadPoolExecutor() as pool:
+        assert list(pool.map(write, contents)) == [None, None, None]  # and no error
+    assert path.read_text() in contents
+    assert names(tmp_path) == {"file"}
 
 
 def test_processes_change_a_file_one_after_the_other(tmp_path, in_copy):

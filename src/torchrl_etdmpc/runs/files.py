@@ -6,6 +6,7 @@ import errno
 import hashlib
 import io
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -26,7 +27,8 @@ class DamagedFileError(RuntimeError):
 def replacing(path: Path) -> Iterator[Path]:
     """Gives a temporary path beside ``path`` and moves it into place, on disk, if the block succeeds.
 
-    The temporary name keeps the suffix (programs that write films choose their format by it).
+    The temporary name is nobody else's, also of those that share the folder from other threads or machines. It keeps
+    the suffix (programs that write films choose their format by it).
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "notes.txt"
@@ -35,7 +37,7 @@ def replacing(path: Path) -> Iterator[Path]:
     >>> path.read_text()
     'whole'
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    partial = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield partial
         sync(partial)
