@@ -647,6 +647,21 @@ def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
     assert not Path("out", "aggregate.png").exists()
 
 
+@pytest.mark.parametrize("order", [("a", "b"), ("b", "a")])
+def test_every_run_s_changes_of_a_task_count(run_main, order):
+    for name, setting in {"a": "episode_length: 100\n", "b": "action_repeat: 2\n"}.items():
+        make_run(f"runs/{name}")
+        with open(f"runs/{name}/config.yaml", "a") as file:
+            file.write(setting)
+    make_run("runs/own")
+    run_main(*(f"{name}=runs/{name}" for name in order), "own=runs/own", "--out", "out")
+    page = Path("out", "index.md").read_text()
+    told = {"a": "episode_length=100 by a", "b": "action_repeat=2 by b"}
+    assert f"- walker-walk was run with {'; '.join(told[name] for name in order)}, not as the benchmark has it." in page
+    assert "- Nothing published stands beside walker-walk: returns of other episodes do not compare.\n" in page
+    assert "BMPC |" not in page
+
+
 def test_runs_of_one_name_on_other_versions_of_a_task_are_not_averaged(refused):
     make_run("runs/a")
     make_run("runs/b", seed=2)

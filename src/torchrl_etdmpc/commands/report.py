@@ -228,8 +228,9 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     methods = [name for name in dict.fromkeys([*planned, *chosen["method"]]) if name in set(chosen["method"])]
     budget, grid_step = choose_budget(arguments, benchmark, chosen, experiments)
     # Published returns are of whole episodes.
-    changed = {run.task: ", ".join(run.changed) for run in found if run.changed and run.task in tasks}
-    shorter = {task for task, settings in changed.items() if "episode_length" in settings}
+    changed = changed_tasks([run for run in found if run.task in tasks])
+    shorter = {run.task for run in found if any(setting.startswith("episode_length") for setting in run.changed)}
+    shorter &= set(tasks)
     seeds, means, unused = [chosen], [], []
     for file, table in zip(arguments.reference, references, strict=True):
         known = table[table["task"].isin(benchmark.tasks)]
@@ -280,6 +281,18 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         at = f", compared at {budget:,}, {which}{known}"
     at += missing(incomplete)
     return f"{counts}, up to {last:,.0f} env steps{at}; the report is {page}"
+
+
+def changed_tasks(runs: list[Run]) -> dict[str, str]:
+    """By task, settings that are not its own, with the names of the runs where others have its own."""
+    changed: dict[str, str] = {}
+    for task in dict.fromkeys(run.task for run in runs if run.changed):
+        methods = {run.method: ", ".join(run.changed) for run in runs if run.task == task}
+        told = dict.fromkeys(settings for settings in methods.values() if settings)
+        names = {settings: [name for name, other in methods.items() if other == settings] for settings in told}
+        whose = len(set(methods.values())) > 1
+        changed[task] = "; ".join(settings + f" by {', '.join(names[settings])}" * whose for settings in told)
+    return changed
 
 
 def ends(runs: Table) -> Table:
