@@ -149,6 +149,22 @@ def test_two_processes_that_share_a_search_close_each_trial_once(search, small, 
     assert [trial.value for trial in study_of(tmp_path).trials] == [500.0, None]
 
 
+def test_a_process_that_begins_while_another_one_proposes_leaves_the_proposal_alone(search, tmp_path, monkeypatch):
+    import optuna
+
+    suggest, others = optuna.trial.Trial._suggest, []
+
+    def suggest_late(trial, name, distribution):
+        if name == "model.mlp_dim" and not others:
+            others.append(Sweep(search(), "tuned", tmp_path))
+        return suggest(trial, name, distribution)
+
+    monkeypatch.setattr(optuna.trial.Trial, "_suggest", suggest_late)
+    (run,) = Sweep(search(), "tuned", tmp_path).propose()
+    assert run.variant == "tuned trial 0"
+    assert others[0].runs() == []
+
+
 def test_two_processes_that_share_a_search_propose_no_more_trials_than_asked(search, tmp_path):
     sweeps = [Sweep(search(trials=3), "tuned", tmp_path) for _ in range(2)]
     for _ in range(4):

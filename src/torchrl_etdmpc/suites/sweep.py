@@ -128,9 +128,7 @@ class Sweep:
         """Goes on with a trial of an earlier process; whether it counts as one."""
         import optuna
 
-        if not self._is_whole(trial):  # killed while it was proposed
-            if not trial.state.is_finished():
-                self._tell(trial.number, math.nan)
+        if not self._is_whole(trial):  # killed while it was proposed, or another process proposes it now
             return False
         if not trial.state.is_finished():
             self._begin(trial.number, trial.params)
