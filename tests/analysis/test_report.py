@@ -15,7 +15,7 @@ import pandas as pd  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from torchrl_etdmpc.analysis import AGGREGATE, Comparison, compare, get_benchmark, write_report  # noqa: E402
+from torchrl_etdmpc.analysis import AGGREGATE, MEAN, Comparison, compare, get_benchmark, write_report  # noqa: E402
 
 TASKS = ("walker-walk", "walker-run")
 STEPS = (0, 100_000, 200_000)
@@ -232,3 +232,30 @@ def test_quoted_means_stand_in_the_aggregate_where_every_task_has_one(monkeypatc
     (points,) = drawn
     # BMPC's return at 200,000, which normalises, is 100 on both.
     assert points[["method", "env_steps", "mean"]].to_numpy().tolist() == [["paper", 50_000, pytest.approx(0.4)]]
+
+
+def test_every_quoted_number_has_its_own_source_and_no_other_number_has_one(tmp_path):
+    rows = [
+        ("BMPC", "walker-run", 20_000, 1.0, "a talk"),  # whose curve begins at 100,000
+        ("paper", "walker-walk", 20_000, 1.0, "table 2"),
+        ("paper", "walker-walk", 100_000, 2.0, "table 2"),
+        ("paper", "walker-run", 100_000, 3.0, "figure 3"),
+    ]
+    quoted = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "source"])
+    page = write_report(comparison(points=quoted), tmp_path)
+    with open(tmp_path / "returns.csv", newline="", encoding="utf-8") as file:
+        found = {
+            (row["method"], row["task"], int(row["env_steps"])): row["source"]
+            for row in csv.DictReader(file)
+            if row["source"]
+        }
+    assert found == {
+        ("BMPC", "walker-run", 20_000): "a talk",
+        ("BMPC", MEAN, 20_000): "a talk",
+        ("paper", "walker-walk", 20_000): "table 2",
+        ("paper", MEAN, 20_000): "table 2",
+        ("paper", "walker-walk", 100_000): "table 2",
+        ("paper", "walker-run", 100_000): "figure 3",
+        ("paper", MEAN, 100_000): "table 2; figure 3",
+    }
+    assert "- paper: table 2\n- paper: figure 3\n" in page.read_text(encoding="utf-8")

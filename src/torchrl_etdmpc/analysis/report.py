@@ -118,15 +118,24 @@ def _tables(comparison: Comparison) -> dict[str, str]:
         "final.csv": to_csv(*finals),
         "final.md": to_markdown(*finals[:2], digits={**dict.fromkeys(comparison.tasks, 1), AGGREGATE: 3}),
     }
-    sources = comparison.points.drop_duplicates("method").set_index("method")["source"]
     long = {
-        "returns.csv": comparison.returns.assign(source=comparison.returns["method"].map(sources)),
+        "returns.csv": _with_sources(comparison),
         "paired.csv": comparison.paired,
     }
     for name, table in long.items():
         if len(table):
             files[name] = table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return files
+
+
+def _with_sources(comparison: Comparison) -> pd.DataFrame:
+    """The returns with where each quoted number stands; a mean has those of the numbers that it is of."""
+    returns, cell = comparison.returns, ["method", "task", "env_steps"]
+    quoted = returns.loc[returns["kind"] == "quoted", cell].merge(comparison.points[[*cell, "source"]], on=cell)
+    if quoted.empty:
+        return returns.assign(source=np.nan)
+    together = quoted.groupby(["method", "env_steps"])["source"].agg(lambda texts: "; ".join(dict.fromkeys(texts)))
+    return returns.merge(pd.concat([quoted, together.reset_index().assign(task=MEAN)]), how="left", on=cell)
 
 
 def _figures(comparison: Comparison) -> dict[str, Figure]:
@@ -220,7 +229,7 @@ def _steps(comparison: Comparison) -> str:
         parts += [f"### At {step:,.0f} environment steps\n", step_table(returns, step, **names)]
         if absent:
             parts.append(f"Not evaluated at {step:,.0f} on any of these tasks: {', '.join(absent)}.\n")
-    sources = points[points["env_steps"].isin(steps)].drop_duplicates("method")
+    sources = points[points["env_steps"].isin(steps)].drop_duplicates(["method", "source"])
     if len(sources):
         parts.append("Quoted numbers, which nobody here has measured, without intervals and seeds:\n")
         parts.append("".join(f"- {row.method}: {row.source}\n" for row in sources.itertuples()))
