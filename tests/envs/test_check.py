@@ -6,7 +6,18 @@ import pytest
 import torch
 import torchrl.envs
 from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, Unbounded
-from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    FrameSkipTransform,
+    InitTracker,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_etdmpc import WorldModel
@@ -166,6 +177,27 @@ _REFUSED = {
 def test_what_no_transform_can_mend_is_refused_in_one_line(fault):
     options, expected = _REFUSED[fault]
     assert expected in faults(SpecEnv(**options))
+
+
+@pytest.mark.parametrize("transforms", [[ActionScaling], [DoubleToFloat, ActionScaling]])
+def test_a_frame_skip_behind_what_changes_the_action_is_refused(transforms):
+    def env(*kinds):
+        env = complete(SpecEnv(action=Bounded(-2, 2, shape=(2,), dtype=torch.float32)))
+        for kind in kinds:
+            env.append_transform(kind(3) if kind is FrameSkipTransform else kind())
+        return env
+
+    check_env(env(FrameSkipTransform, *transforms))
+    assert faults(env(*transforms, FrameSkipTransform)) == (
+        "this environment cannot be used as it is: action is changed once more by each of its repeats (append "
+        "FrameSkipTransform before ActionScaling)."
+    )
+
+
+def test_a_frame_skip_behind_a_cast_is_nobodys_business():
+    env = complete(SpecEnv(action=Bounded(-1, 1, shape=(2,), dtype=torch.float64)))
+    env.append_transform(DoubleToFloat(in_keys_inv=["action"]))
+    check_env(env.append_transform(FrameSkipTransform(3)))
 
 
 def test_one_error_lists_everything():

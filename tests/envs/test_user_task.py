@@ -41,7 +41,11 @@ def limited(): return scaled(StepCounter(30))
 def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
 def unlimited(): return scaled(base=GymWrapper(PendulumEnv()))
 def repeats(): return scaled(frame_skip=4)
-def repeats_by_transform(): return scaled(FrameSkipTransform(4), StepCounter(10))
+def repeats_by_transform():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), FrameSkipTransform(4))
+    env.append_transform(ActionScaling())
+    return env.append_transform(StepCounter(10))
+def repeats_what_is_scaled(): return scaled(FrameSkipTransform(4), StepCounter(10))
 def unscaled(): return GymEnv("Pendulum-v1")
 def number(): return 3
 def two(): return SerialEnv(2, limited)
@@ -132,6 +136,19 @@ def test_a_repeat_that_steps_on_after_an_episode_has_ended_is_refused(folder):
         "episode has ended; repeat them with frame_skip= of GymEnv or DMControlEnv, or in a step of your own, or say "
         "that only the time limit ends its episodes: task.terminates=false."
     )
+
+
+def test_a_repeat_of_actions_that_are_scaled_already_is_refused(folder):
+    with pytest.raises(
+        ValueError, match=r"action is changed once .* \(append FrameSkipTransform before ActionScaling\)"
+    ):
+        make_env(import_task("more_tasks:repeats_what_is_scaled", terminates=False))
+    env = make_env(import_task("more_tasks:repeats_by_transform", terminates=False), seed=0)
+    simulator, arrived = env.base_env._env.unwrapped, []
+    step = simulator.step
+    simulator.step = lambda action: arrived.append(action.item()) or step(action)
+    env.step(env.reset().set("action", torch.tensor([0.5])))
+    assert arrived == [1.0] * 4  # of [-2, 2]
 
 
 @pytest.mark.parametrize("name", ["unlimited", "counted"])

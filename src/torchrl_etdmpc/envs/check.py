@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from tensordict import NestedKey, unravel_key
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import DTypeCastTransform, EnvBase, FrameSkipTransform
+
+from torchrl_etdmpc.envs.layers import transforms_by_layer
 
 __all__ = ["check_env", "check_spaces"]
 
@@ -27,8 +29,8 @@ def check_env(env: EnvBase, model: Any = None) -> None:
     ``episode_reward``                      float32 [1]; the sum of the rewards since the reset
     ======================================= ==============================================================
 
-    It looks at the environment's specs and takes no step; whether the values agree with the specs is what
-    :func:`torchrl.envs.check_env_specs` tests.
+    It looks at the environment's specs and transforms and takes no step; whether the values agree with the specs is
+    what :func:`torchrl.envs.check_env_specs` tests.
 
     Args:
         env (EnvBase): any TorchRL environment, batched or not, with any transforms around it.
@@ -164,6 +166,7 @@ def _action(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) -> Iter
         return
     spec = env.full_action_spec[key]
     yield from action_faults(spec, dtype, key)
+    yield from _repeats(env, key)
     shape = _shape(env, spec)
     if spec.domain != "continuous":
         return
@@ -174,6 +177,18 @@ def _action(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) -> Iter
             f"{_text(key)} has {shape[0]} entries instead of the model's {size} (build the model with "
             f"action_dim={shape[0]})"
         )
+
+
+def _repeats(env: EnvBase, key: NestedKey) -> Iterator[str]:
+    """TorchRL's FrameSkipTransform repeats what the transforms before it have made of an action, through them again."""
+    for layer in transforms_by_layer(env):
+        before: list[str] = []
+        for transform in layer:
+            if isinstance(transform, FrameSkipTransform) and transform.frame_skip > 1 and before:
+                name, first = type(transform).__name__, ", ".join(before)
+                yield f"{_text(key)} is changed once more by each of its repeats (append {name} before {first})"
+            elif transform.in_keys_inv and not isinstance(transform, DTypeCastTransform):
+                before.append(type(transform).__name__)
 
 
 def action_faults(spec: TensorSpec, dtype: torch.dtype = torch.float32, key: NestedKey = "action") -> Iterator[str]:

@@ -12,11 +12,16 @@ def simulator_of(env: EnvBase) -> EnvBase:
     return env
 
 
-def transforms_of(env: EnvBase) -> list[Transform]:
-    """Every transform above the simulator, those of the outermost environment first."""
-    found: list[Transform] = []
+def transforms_by_layer(env: EnvBase) -> list[list[Transform]]:
+    """The transforms of every environment above the simulator, the outermost first; in each the innermost first."""
+    layers: list[list[Transform]] = []
     while isinstance(env, TransformedEnv):
         parts = env.transform.modules()
-        found += (part for part in parts if isinstance(part, Transform) and not isinstance(part, Compose))
+        layers.append([part for part in parts if isinstance(part, Transform) and not isinstance(part, Compose)])
         env = env.base_env
-    return found
+    return layers
+
+
+def transforms_of(env: EnvBase) -> list[Transform]:
+    """Every transform above the simulator, those of the outermost environment first."""
+    return [transform for layer in transforms_by_layer(env) for transform in layer]
