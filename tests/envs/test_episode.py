@@ -23,7 +23,7 @@ from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc import SeedPolicy, StepCollector  # noqa: E402
+from torchrl_etdmpc import SeedPolicy, SimulatorError, StepCollector  # noqa: E402
 from torchrl_etdmpc.envs import get_task, load_simulator_state, simulator_state  # noqa: E402
 from torchrl_etdmpc.envs import make_env as make_any_env  # noqa: E402
 
@@ -307,6 +307,43 @@ def test_a_collector_whose_simulator_does_not_come_back_begins_fresh_episodes_an
     row = collectors[1].step()
     assert row["collector", "traj_ids"].item() == 1
     assert row["next", "step_count"].item() == 1
+
+
+@needs_gym
+def test_a_collector_that_is_saved_after_a_fault_goes_on_though_the_fault_repeats(monkeypatch):
+    import gymnasium
+    from gymnasium.envs.classic_control.pendulum import PendulumEnv
+
+    class Unstable(PendulumEnv):
+        def reset(self, **options):
+            self.steps = 0
+            return super().reset(**options)
+
+        def step(self, action):
+            self.steps += 1
+            if self.steps == 5:
+                raise RuntimeError("unstable")
+            return super().step(action)
+
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+    gymnasium.register("Unstable-v0", Unstable, max_episode_steps=9)
+    collectors = []
+    for seed in (3, 4):
+        env = make_any_env("gym/Unstable-v0", seed=seed)
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50))
+        collectors.append(StepCollector(env, SeedPolicy(env.action_spec), replay_buffer=buffer))
+    for _ in range(4):
+        collectors[0].step()
+    with pytest.raises(SimulatorError, match="failed at decision step 4: unstable"):
+        collectors[0].step()
+    collectors[1].load_state_dict(through_a_file(dict(collectors[0].state_dict())))
+    assert not collectors[1].begins_fresh
+    rows = []
+    for collector in collectors:
+        torch.manual_seed(0)
+        rows.append(collector.step())
+    assert (rows[0] == rows[1]).all()  # the next episode, with its own number
 
 
 def test_a_state_is_small_and_of_plain_types():

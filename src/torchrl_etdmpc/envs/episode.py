@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 import copy
 from collections.abc import Callable
 from typing import Any
@@ -118,7 +119,7 @@ class RecordedEnv(EnvBase):
         }
 
     def set_extra_state(self, state: dict[str, Tensor] | None) -> None:
-        """Goes through the episode again.
+        """Goes through the episode again, up to where the simulator failed if it did.
 
         Afterwards :meth:`get_extra_state` equals ``state`` if the simulator is as deterministic here as it was there.
         """
@@ -126,7 +127,8 @@ class RecordedEnv(EnvBase):
             return
         self._set_random_state(state["random"])
         self.restored = self._reset().get("observation"), False
-        self.go_on(state["actions"])
+        with contextlib.suppress(Exception):  # what failed there fails here, too, and a worker process must outlive it
+            self.go_on(state["actions"])
 
     def go_on(self, actions: Tensor) -> None:
         """Takes more actions of a recorded episode, the suite's own, float64 [T, A]."""
