@@ -95,6 +95,25 @@ def test_a_simulator_that_draws_from_global_generators_leaves_them_too(agent):
     assert states[0] == states[1]
 
 
+class StartsFromGlobals(Transform):
+    """Episodes begin where the generators that Python and NumPy share say, as those of some simulators do."""
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        shift = np.random.rand() + random.random()
+        return tensordict_reset.set("observation", tensordict_reset["observation"] + shift)
+
+
+def test_episodes_that_begin_by_global_generators_are_the_same_every_time(agent):
+    evaluator, starts = make_evaluator(agent, with_policy=True), []
+    evaluator.env.append_transform(StartsFromGlobals())
+    for _ in range(2):
+        seen: list[Tensor] = []
+        evaluator(on_step=lambda step, seen=seen: seen.append(step["observation"].clone()))
+        starts += [seen[0], seen[24]]  # with the planner in two rounds, and with the policy alone
+        np.random.rand(), random.random()  # what training draws
+    assert all(torch.equal(start, starts[0]) for start in starts)
+
+
 def test_an_evaluation_that_is_left_leaves_the_random_numbers_too(agent):
     def leave(step: TensorDictBase) -> None:
         raise KeyboardInterrupt

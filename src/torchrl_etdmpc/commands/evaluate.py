@@ -22,6 +22,7 @@ from torchrl_etdmpc.runs.files import make_folder_of, write_whole
 from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
 from torchrl_etdmpc.training.config import MOST_EPISODES
+from torchrl_etdmpc.training.seeding import seed_everything
 
 GIF_SIZE = 200  # pixels, for a page
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks
@@ -75,7 +76,6 @@ def main(config: EvaluateConfig) -> None:
         device=device,
         compile_setting="off",
     )
-    torch.manual_seed(config.seed)
     if config.policy == "planner":
         policy = config.planner_of(agent)
         env = env.append_transform(policy.make_tensordict_primer())
@@ -98,6 +98,7 @@ def main(config: EvaluateConfig) -> None:
         render_frame(_first(env), *size)
         film_writer(config.video)
         env.set_seed(config.seed)  # the episodes are those that are played without a film
+    seed_everything(config.seed)
     played = evaluate(
         env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
     )

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.training.agent import Agent
+from torchrl_etdmpc.training.seeding import seed_everything
 
 
 @contextlib.contextmanager
@@ -114,7 +115,7 @@ class Evaluator:
         )
 
     def _play(self, policy: nn.Module, on_step: Callable[[TensorDictBase], None] | None) -> Episodes:
-        torch.manual_seed(self.seed)
+        seed_everything(self.seed)
         self.env.set_seed(self.seed)
         return evaluate(self.env, policy, episodes=self.episodes, policy_device=self.agent.device, on_step=on_step)
 

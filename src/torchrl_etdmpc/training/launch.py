@@ -24,6 +24,7 @@ from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 from torchrl_etdmpc.training.distributed import DistributedConfig, is_distributed
 from torchrl_etdmpc.training.estimate import what_it_takes
+from torchrl_etdmpc.training.seeding import seed_everything
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.train import TrainingRun
 
@@ -169,7 +170,7 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
             stack.callback(torch.set_num_threads, torch.get_num_threads())  # a sweep's next run may leave them open
             torch.set_num_threads(config.threads)
         torch.set_float32_matmul_precision("high")
-        torch.manual_seed(config.seed)
+        seed_everything(config.seed)
         env = make_env(config.task_spec, seed=config.seed, num_envs=config.num_envs)
         stack.callback(env.close, raise_if_closed=False)
         eval_env = make_env(config.task_spec, num_envs=config.eval_episodes, parallel=False)

@@ -29,6 +29,7 @@ from torchrl_etdmpc.runs import first_line
 from torchrl_etdmpc.training.agent import build_planner, build_world_model
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 from torchrl_etdmpc.training.own_code import follow_own_code
+from torchrl_etdmpc.training.seeding import seed_everything
 
 Engine = Literal["multi", "ray"]
 
@@ -93,7 +94,7 @@ class WorkerParts:
         """
         self._prepare()
         seed = (self.config.seed * 1_000_003 + number) % 2**32
-        torch.manual_seed(seed)
+        seed_everything(seed)
         env = make_env(self.config.task_spec, seed=seed)
         primer = TensorDictPrimer({WORKER: Unbounded(1, dtype=torch.int64)}, default_value=number)
         return env.append_transform(primer)
