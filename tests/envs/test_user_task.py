@@ -37,6 +37,12 @@ def frozen():
     env.rollout(3)
     env.transform[-2].freeze()
     return env
+def normed_by_gymnasium():
+    return scaled(base=GymWrapper(gymnasium.wrappers.NormalizeReward(gymnasium.make("Pendulum-v1"))))
+def frozen_by_gymnasium():
+    env = normed_by_gymnasium()
+    env.base_env._env.update_running_mean = False
+    return env
 def limited(): return scaled(StepCounter(30))
 def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
 def unlimited(): return scaled(base=GymWrapper(PendulumEnv()))
@@ -236,6 +242,11 @@ def test_statistics_that_move_in_every_copy_are_refused_unless_they_are_frozen(f
         ValueError, match=r"^task 'more_tasks:normed': VecNormV2 has .* model\.normalize_observations=true"
     ):
         make_env(import_task("more_tasks:normed"), num_envs=2, parallel=False)
+    with pytest.raises(
+        ValueError, match="NormalizeReward has statistics that move, .*; set update_running_mean = False"
+    ):
+        make_env(import_task("more_tasks:normed_by_gymnasium"))
+    make_env(import_task("more_tasks:frozen_by_gymnasium"))
     env = make_env(import_task("more_tasks:frozen"))
     assert any(isinstance(transform, VecNormV2) for transform in env.transform)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 
@@ -25,3 +27,16 @@ def transforms_by_layer(env: EnvBase) -> list[list[Transform]]:
 def transforms_of(env: EnvBase) -> list[Transform]:
     """Every transform above the simulator, those of the outermost environment first."""
     return [transform for layer in transforms_by_layer(env) for transform in layer]
+
+
+def wrappers_of(env: EnvBase) -> list[Any]:
+    """What TorchRL's wrapper of a library holds: Gymnasium's wrappers, the outermost first, and the environment itself.
+
+    Empty for a simulator that is TorchRL's own.
+    """
+    found: list[Any] = []
+    layer = vars(simulator_of(env)).get("_env")
+    while layer is not None:
+        found.append(layer)
+        layer = getattr(layer, "env", None)
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, RewardSum, SerialEnv, VecNorm
@@ -14,7 +15,7 @@ from torchrl_etdmpc.envs.check import check_env
 from torchrl_etdmpc.envs.dmc import dmc_maker
 from torchrl_etdmpc.envs.gymnasium import gymnasium_maker
 from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_maker
-from torchrl_etdmpc.envs.layers import transforms_of
+from torchrl_etdmpc.envs.layers import transforms_of, wrappers_of
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
 from torchrl_etdmpc.envs.worker import make_in_worker, start_workers
 
@@ -127,13 +128,14 @@ def _make_one(make: Maker, task: Task, *, device: torch.device | str) -> EnvBase
         raise ValueError(f"the maker of task {task.name!r} must return a TorchRL environment, got {env!r}.")
     if env.batch_size:
         raise ValueError(f"task {task.name!r} must be a single environment, got batch size {list(env.batch_size)}.")
-    for transform in transforms_of(env):
-        if isinstance(transform, VecNorm | VecNormV2) and not transform.frozen:
-            raise ValueError(
-                f"task {task.name!r}: {type(transform).__name__} has statistics that move, other ones in every copy of "
-                "the environment, so training and evaluation would see different numbers; freeze() them, or leave it "
-                "out and set model.normalize_observations=true, whose statistics are the agent's."
-            )
+    moving = [(layer, "freeze() them") for layer in transforms_of(env) if _moves(layer)]
+    moving += [(layer, "set update_running_mean = False") for layer in wrappers_of(env) if _moves(layer)]
+    for layer, remedy in moving:
+        raise ValueError(
+            f"task {task.name!r}: {type(layer).__name__} has statistics that move, other ones in every copy of the "
+            f"environment, so training and evaluation would see different numbers; {remedy}, or leave it out and set "
+            "model.normalize_observations=true, whose statistics are the agent's."
+        )
     # The two entries that can be added without guessing.
     for key, transform in (("is_init", InitTracker), ("episode_reward", RewardSum)):
         if env.full_observation_spec.get(key, None) is None:
@@ -143,3 +145,10 @@ def _make_one(make: Maker, task: Task, *, device: torch.device | str) -> EnvBase
     except ValueError as error:
         raise ValueError(f"task {task.name!r}: {error}") from None
     return env
+
+
+def _moves(layer: Any) -> bool:
+    """Whether a transform, or a wrapper of Gymnasium, has statistics that its steps move."""
+    if isinstance(layer, VecNorm | VecNormV2):
+        return not layer.frozen
+    return getattr(layer, "update_running_mean", None) is True
