@@ -73,6 +73,16 @@ def test_each_dimension_has_bounds_of_its_own_and_ends_are_reached_exactly(recor
     np.testing.assert_allclose(arrived[3], [-1 + float(np.float32(0.1)), 2 - 0.25 * 1.5], rtol=1e-15)
 
 
+def test_no_bound_is_passed_by_rounding(recorder):
+    bounds = np.random.default_rng(0).normal(size=(2, 2000)).round(1)
+    env = make_env(recorder(action=Box(bounds.min(0), bounds.max(0), dtype=np.float64)))
+    state = env.reset()
+    for end in (-1.0, 1.0):
+        state = env.step_mdp(env.step(state.set("action", torch.full((2000,), end))))
+    for arrived, wanted in zip(env._env.unwrapped.arrived, (bounds.min(0), bounds.max(0)), strict=True):
+        np.testing.assert_allclose(arrived, wanted, rtol=0, atol=1e-15)  # and within, which the environment asserts
+
+
 def test_actions_of_any_shape_and_precision_arrive_as_the_environment_wants_them(recorder):
     env = make_env(recorder(action=Box(-3, 3, (2, 2), np.float32)))
     assert env.action_spec.shape == (4,)

@@ -68,6 +68,9 @@ class RecordedEnv(EnvBase):
         )
         self.reward_spec = Unbounded(1, dtype=torch.float32, device=self.device)
         self._middle, self._half_width = (high + low) / 2, (high - low) / 2
+        # Rounding may lead past the bounds by a bit, where a simulator that checks its actions fails.
+        past = (self._middle + self._half_width > high) | (self._middle - self._half_width < low)
+        self._half_width = self._half_width - past * np.spacing(np.maximum(abs(low), abs(high)))
         self.action_spec = Bounded(-1, 1, shape=low.shape, dtype=torch.float32, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
