@@ -51,7 +51,16 @@ def repeats_by_transform():
     env = TransformedEnv(GymEnv("Pendulum-v1"), FrameSkipTransform(4))
     env.append_transform(ActionScaling())
     return env.append_transform(StepCounter(10))
+def repeats_over_the_limit(): return TransformedEnv(GymEnv("Pendulum-v1"), FrameSkipTransform(7))
 def repeats_what_is_scaled(): return scaled(FrameSkipTransform(4), StepCounter(10))
+def wrapped(*wrappers):
+    env = PendulumEnv()
+    for kind, number in wrappers:
+        env = getattr(gymnasium.wrappers, kind)(env, number)
+    return scaled(base=GymWrapper(env))
+def limited_by_wrapper(): return wrapped(("TimeLimit", 12))
+def repeats_by_wrapper(): return wrapped(("TimeLimit", 12), ("RepeatAction", 3))
+def repeats_and_is_limited(): return wrapped(("RepeatAction", 3), ("TimeLimit", 5))
 def unscaled(): return GymEnv("Pendulum-v1")
 def number(): return 3
 def two(): return SerialEnv(2, limited)
@@ -126,12 +135,42 @@ def test_several_environments_of_a_users_task(folder, path, parallel):
 
 
 @pytest.mark.parametrize(
-    ("name", "repeat", "length"), [("limited", 1, 30), ("repeats", 4, 200), ("repeats_by_transform", 4, 40)]
+    ("name", "repeat", "length"),
+    [
+        ("limited", 1, 30),
+        ("limited_by_wrapper", 1, 12),
+        ("repeats", 4, 200),
+        ("repeats_by_transform", 4, 40),
+        ("repeats_by_wrapper", 3, 12),
+        ("repeats_and_is_limited", 3, 15),
+    ],
 )
 def test_what_an_environment_shows_is_read(folder, name, repeat, length):
     task = import_task(f"more_tasks:{name}", terminates=False)
     assert (task.action_repeat, task.episode_length) == (repeat, length)
     assert make_env(task).rollout(1000).shape == (task.decision_steps_per_episode,)
+
+
+def test_the_time_limit_of_dm_control_is_read(folder):
+    pytest.importorskip("dm_control")
+    (folder / "of_dm_control.py").write_text(
+        "from torchrl.envs import CatTensors, DMControlEnv, DoubleToFloat, TransformedEnv\n"
+        "def make():\n"
+        "    env = TransformedEnv(DMControlEnv('cartpole', 'balance', frame_skip=20), DoubleToFloat())\n"
+        "    return env.append_transform(CatTensors(['position', 'velocity'], 'observation'))\n"
+    )
+    task = import_task("of_dm_control:make", terminates=False)
+    assert (task.action_repeat, task.episode_length) == (20, 1000)
+    rollout = make_env(task).rollout(1000)
+    assert rollout.shape == (50,)
+    assert rollout["next", "truncated"][-1].item()
+    with pytest.raises(ValueError, match="must be at most 1000, its environment's own limit, got 2000"):
+        import_task("of_dm_control:make", episode_length=2000)
+
+
+def test_a_repeat_that_steps_over_the_time_limit_is_refused(folder):
+    with pytest.raises(ValueError, match="repeats actions 7 times with FrameSkipTransform, .* limit of 200 env steps"):
+        import_task("more_tasks:repeats_over_the_limit", terminates=False)
 
 
 def test_a_repeat_that_steps_on_after_an_episode_has_ended_is_refused(folder):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter
 
-from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
+from torchrl_etdmpc.envs.layers import simulator_of, transforms_of, wrappers_of
 from torchrl_etdmpc.envs.make import find_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
 
@@ -40,7 +41,7 @@ def import_task(
             has to, so here it can only be told what is true.
         episode_length (int, optional): the time limit in env steps; a function's environment without one, or with a
             longer one, is truncated there. Needed where the environment does not show a limit (a
-            :class:`~torchrl.envs.transforms.StepCounter`, or a Gymnasium environment's own).
+            :class:`~torchrl.envs.transforms.StepCounter`, or the own one of Gymnasium or dm_control).
         terminates (bool, optional): whether an episode can end for another reason than the time limit; ``True`` for a
             function unless told.
 
@@ -144,7 +145,14 @@ def _require_agreement(task: Task, env: EnvBase) -> None:
             f"episode_length of task {task.name!r} must be at most {limit}, its environment's own limit, got "
             f"{task.episode_length}."
         )
-    if task.terminates and any(isinstance(transform, FrameSkipTransform) for transform in transforms_of(env)):
+    skips = any(isinstance(transform, FrameSkipTransform) for transform in transforms_of(env))
+    if skips and any(own % repeat for own in _simulators_limits(env)):
+        raise ValueError(
+            f"task {task.name!r} repeats actions {repeat} times with FrameSkipTransform, which steps on behind the "
+            f"time limit of {min(_simulators_limits(env))} env steps, dm_control into its next episode; repeat them "
+            "with frame_skip= of GymEnv or DMControlEnv, or as often as divides the limit."
+        )
+    if task.terminates and skips:
         raise ValueError(
             f"task {task.name!r} repeats actions with FrameSkipTransform, which steps on where an episode has ended; "
             "repeat them with frame_skip= of GymEnv or DMControlEnv, or in a step of your own, or say that only the "
@@ -165,7 +173,7 @@ def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
 
 def _action_repeat(env: EnvBase) -> int:
     """Env steps per step of this environment, as far as its layers tell."""
-    repeat = 1
+    repeat = math.prod(_wrapper_repeat(wrapper) for wrapper in wrappers_of(env))
     for layer in [*transforms_of(env), simulator_of(env)]:
         # Of an environment that cannot repeat actions itself, TorchRL keeps the number and appends the transform.
         if isinstance(layer, FrameSkipTransform) or getattr(type(layer), "_has_frame_skip", False):
@@ -173,11 +181,26 @@ def _action_repeat(env: EnvBase) -> int:
     return repeat
 
 
+def _wrapper_repeat(wrapper: Any) -> int:
+    """How often a wrapper of Gymnasium repeats an action."""
+    told_by = {"RepeatAction": "num_repeats", "MaxAndSkipObservation": "_skip"}.get(type(wrapper).__name__, "")
+    return int(vars(wrapper).get(told_by, 1))
+
+
 def _limit(env: EnvBase) -> int | None:
     """The time limit of this environment in env steps, the least that its layers tell."""
-    spec = getattr(getattr(simulator_of(env), "_env", None), "spec", None)
-    limits = [getattr(spec, "max_episode_steps", None)]
-    for transform in transforms_of(env):
-        if isinstance(transform, StepCounter) and transform.max_steps is not None:
-            limits.append(transform.max_steps * _action_repeat(env))
-    return min((limit for limit in limits if limit is not None), default=None)
+    counters = (transform for transform in transforms_of(env) if isinstance(transform, StepCounter))
+    limits = [counter.max_steps * _action_repeat(env) for counter in counters if counter.max_steps is not None]
+    return min([*limits, *_simulators_limits(env)], default=None)
+
+
+def _simulators_limits(env: EnvBase) -> list[int]:
+    """Those of Gymnasium's wrappers and of dm_control, in env steps."""
+    wrappers, limits, repeat = wrappers_of(env), [], 1
+    for wrapper in reversed(wrappers):  # the innermost first, whose steps are env steps
+        limits.append((vars(wrapper).get("_max_episode_steps") or math.inf) * repeat)
+        limits.append(vars(wrapper).get("_step_limit", math.inf))
+        repeat *= _wrapper_repeat(wrapper)
+    limits = [math.ceil(limit) for limit in limits if limit < math.inf]
+    told = getattr(getattr(wrappers[0], "spec", None), "max_episode_steps", None) if wrappers else None
+    return limits or ([] if told is None else [told])
