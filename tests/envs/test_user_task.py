@@ -22,8 +22,9 @@ _MORE = """
 import gymnasium
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import RewardScaling
 from torchrl.envs.transforms import VecNormV2
-from torchrl_etdmpc.envs import Task, register_task
+from torchrl_etdmpc.envs import Task, make_env, register_task
 
 def scaled(*transforms, base=None, **options):
     env = TransformedEnv(base or GymEnv("Pendulum-v1", **options), ActionScaling())
@@ -43,6 +44,7 @@ def frozen_by_gymnasium():
     env = normed_by_gymnasium()
     env.base_env._env.update_running_mean = False
     return env
+def of_a_suite(): return TransformedEnv(make_env("gym/Pendulum-v1"), RewardScaling(0, 0.1))
 def limited(): return scaled(StepCounter(30))
 def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
 def unlimited(): return scaled(base=GymWrapper(PendulumEnv()))
@@ -288,6 +290,17 @@ def test_statistics_that_move_in_every_copy_are_refused_unless_they_are_frozen(f
     make_env(import_task("more_tasks:frozen_by_gymnasium"))
     env = make_env(import_task("more_tasks:frozen"))
     assert any(isinstance(transform, VecNormV2) for transform in env.transform)
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_the_episode_s_reward_is_the_sum_of_rewards_that_a_transform_has_changed(folder, num_envs):
+    task = import_task("more_tasks:of_a_suite", terminates=False, episode_length=5)
+    env = make_env(task, seed=0, num_envs=num_envs, parallel=False)
+    rollout = env.rollout(12, break_when_any_done=False).reshape(num_envs, 12)
+    reward, total = (rollout["next", key].squeeze(-1) for key in ("reward", "episode_reward"))
+    for begin in (0, 5, 10):
+        expected = reward[:, begin : begin + 5].cumsum(1)
+        torch.testing.assert_close(total[:, begin : begin + 5], expected)
 
 
 def test_a_users_own_transforms_stay(folder):

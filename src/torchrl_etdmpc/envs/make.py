@@ -136,9 +136,10 @@ def _make_one(make: Maker, task: Task, *, device: torch.device | str) -> EnvBase
             f"environment, so training and evaluation would see different numbers; {remedy}, or leave it out and set "
             "model.normalize_observations=true, whose statistics are the agent's."
         )
-    # The two entries that can be added without guessing.
+    # The two entries that can be added without guessing; a sum of rewards that transforms have changed is another one.
+    changed = _rewards_change(env)
     for key, transform in (("is_init", InitTracker), ("episode_reward", RewardSum)):
-        if env.full_observation_spec.get(key, None) is None:
+        if env.full_observation_spec.get(key, None) is None or (transform is RewardSum and changed):
             env = env.append_transform(transform())
     try:
         check_env(env)
@@ -152,3 +153,11 @@ def _moves(layer: Any) -> bool:
     if isinstance(layer, VecNorm | VecNormV2):
         return not layer.frozen
     return getattr(layer, "update_running_mean", None) is True
+
+
+def _rewards_change(env: EnvBase) -> bool:
+    """Whether transforms change rewards of which the simulator itself writes the sum, as those of the suites do."""
+    transforms = transforms_of(env)
+    if any(isinstance(transform, RewardSum) for transform in transforms):
+        return False
+    return any(key in (transform.out_keys or ()) for transform in transforms for key in env.reward_keys)
