@@ -63,6 +63,8 @@ def wrapped(*wrappers):
 def limited_by_wrapper(): return wrapped(("TimeLimit", 12))
 def repeats_by_wrapper(): return wrapped(("TimeLimit", 12), ("RepeatAction", 3))
 def repeats_and_is_limited(): return wrapped(("RepeatAction", 3), ("TimeLimit", 5))
+ONE = scaled()
+def the_same(): return ONE
 def unscaled(): return GymEnv("Pendulum-v1")
 def number(): return 3
 def two(): return SerialEnv(2, limited)
@@ -264,6 +266,17 @@ def test_mistakes_in_the_users_code_keep_their_own_error(folder):
         import_task("misses_one:make")
     with pytest.raises(ZeroDivisionError):
         import_task("more_tasks:broken")
+
+
+def test_an_environment_that_is_returned_twice_is_refused(folder):
+    task = import_task("more_tasks:the_same")  # looks at one
+    for options in ({}, {"num_envs": 2, "parallel": False}):
+        with pytest.raises(ValueError) as error:
+            make_env(task, **options).reset()
+        assert str(error.value) == (
+            "task 'more_tasks:the_same' must return a new environment every time, got one that it had returned before: "
+            "training and evaluation would step the same."
+        )
 
 
 def test_what_a_users_environment_lacks_is_named(folder):

@@ -7,6 +7,7 @@ import importlib
 import math
 import os
 import sys
+import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -19,6 +20,10 @@ from torchrl_etdmpc.envs.make import find_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
 
 __all__ = ["import_attribute", "import_task"]
+
+
+_returned: dict[str, weakref.WeakSet[EnvBase]] = {}
+"""By the path to a function, the simulators that it has returned."""
 
 
 def import_task(
@@ -168,6 +173,13 @@ def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
         raise ValueError(
             f"task {path!r} must return one environment, got {list(env.batch_size)} of them; use num_envs=."
         )
+    before, simulator = _returned.setdefault(path, weakref.WeakSet()), simulator_of(env)
+    if simulator in before:
+        raise ValueError(
+            f"task {path!r} must return a new environment every time, got one that it had returned before: training "
+            "and evaluation would step the same."
+        )
+    before.add(simulator)
     return env
 
 
