@@ -66,6 +66,7 @@ def repeats_and_is_limited(): return wrapped(("RepeatAction", 3), ("TimeLimit", 
 ONE = scaled()
 def the_same(): return ONE
 def unscaled(): return GymEnv("Pendulum-v1")
+def not_wrapped(): return PendulumEnv()
 def number(): return 3
 def two(): return SerialEnv(2, limited)
 def broken(): return 1 / 0
@@ -252,6 +253,11 @@ def test_a_task_of_a_file_keeps_its_numbers_and_maker(folder):
         ("my_file:other", r"task 'my_file:other': the module 'my_file' \(.*my_file\.py\) has no 'other'\."),
         ("more_tasks:VALUE", r"task 'more_tasks:VALUE' must be a function or a Task, got int\."),
         ("more_tasks:number", r"task 'more_tasks:number' must return a TorchRL environment, got int\."),
+        (
+            "more_tasks:not_wrapped",
+            r"task 'more_tasks:not_wrapped' must return a TorchRL environment, got PendulumEnv; return "
+            r"GymWrapper\(env\), of torchrl\.envs\.",
+        ),
         ("more_tasks:two", r"task 'more_tasks:two' must return one environment, got \[2\] of them; use num_envs=\."),
         ("more_tasks:OF_NOBODY", r"nothing makes the suite 'nobody' of task 'nobodys'; .*"),
     ],

@@ -144,7 +144,10 @@ def _require_vectors(name: str, env: Any) -> None:
 
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, Box):
-        raise ValueError(f"{name} has observations of type {type(observations).__name__}; only vectors are supported.")
+        raise ValueError(
+            f"{name} has observations of type {type(observations).__name__}; only vectors are supported, which "
+            "gymnasium.wrappers.FlattenObservation makes of them in a function of your own (task=MODULE:FUNCTION)."
+        )
     if observations.dtype == np.uint8 and len(observations.shape) > 1 or len(observations.shape) == 3:
         raise ValueError(f"{name} has pixel observations {list(observations.shape)}; only vectors are supported.")
     if isinstance(actions, Dict | Tuple):

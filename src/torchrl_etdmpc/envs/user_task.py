@@ -168,7 +168,8 @@ def _require_agreement(task: Task, env: EnvBase) -> None:
 def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
     env = function()
     if not isinstance(env, EnvBase):
-        raise ValueError(f"task {path!r} must return a TorchRL environment, got {type(env).__name__}.")
+        remedy = "; return GymWrapper(env), of torchrl.envs" if hasattr(env, "action_space") else ""
+        raise ValueError(f"task {path!r} must return a TorchRL environment, got {type(env).__name__}{remedy}.")
     if env.batch_size:
         raise ValueError(
             f"task {path!r} must return one environment, got {list(env.batch_size)} of them; use num_envs=."
