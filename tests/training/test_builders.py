@@ -1,9 +1,14 @@
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import CatTensors, StepCounter
 
+from torchrl_etdmpc import EfficientTDMPCLoss
+from torchrl_etdmpc.objectives import Term
 from torchrl_etdmpc.training import (
     build_agent,
     build_collector,
@@ -62,6 +67,29 @@ def test_a_row_has_the_bytes_that_the_rule_counts_with(tiny_config):
         collector.step()
     generation = 8  # an integer per row, kept by the writer
     assert replay[:].bytes() / 3 == row_bytes(24, 6) - generation
+
+
+def test_what_an_environment_observes_and_no_term_reads_is_not_stored(tiny_config):
+    pytest.importorskip("dm_control")
+    from torchrl_etdmpc.envs import make_env
+
+    def stored(*keys):
+        config = tiny_config(task="walker-walk")
+        env = make_env("walker-walk", seed=0).append_transform(StepCounter())
+        env.append_transform(CatTensors(["observation"], "copy", del_keys=False))
+        agent, replay = build_agent(config, 24, 6), build_replay(config)
+        if keys:
+            term = Term("idle", lambda world_model, slices, rollout: slices.reward, keys=("reward", *keys))
+            loss = EfficientTDMPCLoss(agent.world_model, discount=0.99, extra_terms=[term])
+            agent = dataclasses.replace(agent, loss=loss)
+        collector = build_collector(config, agent, env, replay)
+        for _ in range(3):
+            collector.step()
+        return replay[:]
+
+    assert stored().bytes() / 3 == row_bytes(24, 6) - 8  # the generation, kept by the writer
+    further = set(stored("step_count", ("next", "copy")).keys(True, True)) - set(stored().keys(True, True))
+    assert further == {"step_count", ("next", "copy")}
 
 
 def test_a_sample_is_a_batch_of_slices(tiny_config):

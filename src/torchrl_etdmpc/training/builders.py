@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import torch
+from tensordict import NestedKey, unravel_key
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import SeedPolicy, StepCollector
-from torchrl_etdmpc.keys import TRAJECTORY, WORKER
+from torchrl_etdmpc.keys import NEXT, TRAJECTORY, WORKER
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig, named_settings
@@ -138,6 +139,21 @@ def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayB
     return reanalyze.attach(replay)
 
 
+def unread_keys(env: EnvBase, agent: Agent) -> tuple[NestedKey, ...]:
+    """What is not stored: :data:`UNREAD`, and what else a user's environment observes and no term of the loss reads.
+
+    Pixels to look at, counts, what the simulator knows: it would fill the memory, which is counted without it.
+
+    Args:
+        env (EnvBase): the environment.
+        agent (Agent): whose loss reads rows.
+    """
+    read = {*map(unravel_key, agent.loss.in_keys), (NEXT, "episode_reward")}
+    observed = list(env.full_observation_spec.keys(True, True))
+    written = [*observed, *(unravel_key((NEXT, key)) for key in observed)]
+    return (*UNREAD, *(key for key in written if key not in {*read, *UNREAD}))
+
+
 def build_collector(
     config: TrainConfig, agent: Agent, env: EnvBase, replay: TensorDictReplayBuffer
 ) -> StepCollector | WorkerCollector:
@@ -153,7 +169,7 @@ def build_collector(
     >>> collector.shutdown()
     """
     if isinstance(config, DistributedConfig):
-        return WorkerCollector(config, agent, env, replay, exclude_keys=UNREAD)
+        return WorkerCollector(config, agent, env, replay, exclude_keys=unread_keys(env, agent))
     return StepCollector(
         env,
         agent.planner,
@@ -162,6 +178,6 @@ def build_collector(
         init_random_frames=config.seed_decisions,
         seed_policy=SeedPolicy(env.action_spec, hold=config.replay.seed_hold),
         insertion=config.replay.insertion,
-        exclude_keys=UNREAD,
+        exclude_keys=unread_keys(env, agent),
         policy_device=agent.device,
     )
