@@ -5,10 +5,13 @@ import importlib.util
 import io
 import multiprocessing
 import os
+import random
 import signal
 import subprocess
 import sys
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import ActionScaling, EnvBase, GymEnv, SerialEnv, StepCounter, TransformedEnv
@@ -18,7 +21,7 @@ pytest.importorskip("dm_control")
 pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import Task, check_env, get_task, make_env, register_task  # noqa: E402
-from torchrl_etdmpc.envs.worker import SilentWithoutOwner, signals_held_back  # noqa: E402
+from torchrl_etdmpc.envs.worker import SilentWithoutOwner, make_in_worker, signals_held_back  # noqa: E402
 
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("imageio") is None, reason="needs gymnasium[mujoco]")
 
@@ -251,6 +254,15 @@ def test_a_process_that_ends_before_its_environment_is_made_is_one_line():
     register_task(task, fatal, replace=True)
     with pytest.raises(RuntimeError, match=r"^a process of task .fatal-pendulum. ended before its env"):
         make_env(task, num_envs=2)
+
+
+def test_a_worker_s_seed_is_that_of_the_generators_that_simulators_share_too():
+    env, drawn = make_in_worker(partial(own, get_task("own-pendulum")), os.getpid()), []
+    for seed in (3, 3, 4):
+        following = env.set_seed(seed)
+        drawn.append((np.random.rand(), random.random(), env.reset()["observation"].tolist()))
+    assert drawn[0] == drawn[1] != drawn[2]
+    assert following == own(get_task("own-pendulum"), device="cpu").set_seed(4)
 
 
 def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):

@@ -6,12 +6,15 @@ import contextlib
 import multiprocessing
 import multiprocessing.connection
 import os
+import random
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from multiprocessing import resource_tracker
 from typing import Any, TextIO
 
+import numpy as np
 import torch
 from torchrl.envs import EnvBase, ParallelEnv
 
@@ -98,7 +101,16 @@ def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
         sys.stderr = SilentWithoutOwner(sys.stderr, process.sentinel)
         if hasattr(signal, "SIGALRM"):
             _outlive_signals(process.sentinel)
-    return make(device="cpu")
+    env = make(device="cpu")
+    env.set_seed = partial(_set_seed, env.set_seed)
+    return env
+
+
+def _set_seed(set_seed: Callable[..., int], seed: int, static_seed: bool = False) -> int:
+    """Seeds a worker's environment, and what its simulator may draw from besides: the process is the worker's alone."""
+    np.random.seed(seed)
+    random.seed(seed)
+    return set_seed(seed, static_seed=static_seed)
 
 
 def _outlive_signals(owner: int) -> None:
