@@ -22,7 +22,7 @@ _MORE = """
 import gymnasium
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
-from torchrl.envs import RewardScaling
+from torchrl.envs import ObservationNorm, RewardScaling
 from torchrl.envs.transforms import VecNormV2
 from torchrl_etdmpc.envs import Task, make_env, register_task
 
@@ -33,11 +33,21 @@ def scaled(*transforms, base=None, **options):
     return env
 
 def normed(): return scaled(VecNormV2(in_keys=["observation"]), StepCounter(30))
-def frozen():
+def measured():
     env = normed()
     env.rollout(3)
     env.transform[-2].freeze()
     return env
+def frozen():
+    env = normed()
+    env.transform[-2].set_extra_state(STATISTICS)
+    env.transform[-2].freeze()
+    return env
+def standardised():
+    env = scaled(ObservationNorm(in_keys=["observation"]), StepCounter(30))
+    env.transform[1].init_stats(5)
+    return env
+def standardised_by_constants(): return scaled(ObservationNorm(1.0, 2.0, in_keys=["observation"]), StepCounter(30))
 def normed_by_gymnasium():
     return scaled(base=GymWrapper(gymnasium.wrappers.NormalizeReward(gymnasium.make("Pendulum-v1"))))
 def frozen_by_gymnasium():
@@ -75,6 +85,10 @@ VALUE = 3
 def maker(task, *, device):
     assert task.name == "registered-in-a-file"
     return scaled(StepCounter(task.decision_steps_per_episode), frame_skip=task.action_repeat)
+
+_OF = normed()
+_OF.rollout(3)
+STATISTICS = _OF.transform[-2].get_extra_state()
 
 REGISTERED = Task("registered-in-a-file", "mine", episode_length=12, terminates=False)
 register_task(REGISTERED, maker, replace=True)  # the tests import this file again and again
@@ -320,6 +334,20 @@ def test_the_episode_s_reward_is_the_sum_of_rewards_that_a_transform_has_changed
     for begin in (0, 5, 10):
         expected = reward[:, begin : begin + 5].cumsum(1)
         torch.testing.assert_close(total[:, begin : begin + 5], expected)
+
+
+@pytest.mark.parametrize(("name", "transform"), [("measured", "VecNormV2"), ("standardised", "ObservationNorm")])
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_statistics_that_every_copy_measures_for_itself_are_refused(folder, name, transform, num_envs):
+    task = import_task(f"more_tasks:{name}")
+    with pytest.raises(ValueError) as error:
+        make_env(task, num_envs=num_envs, parallel=False).reset()
+    assert str(error.value) == (
+        f"task 'more_tasks:{name}': {transform} has other numbers in every environment that is made, so training and "
+        "evaluation would see different ones; give it fixed numbers, or leave it out and set "
+        "model.normalize_observations=true, whose statistics are the agent's."
+    )
+    make_env(import_task("more_tasks:standardised_by_constants"), num_envs=num_envs, parallel=False).reset()
 
 
 def test_a_users_own_transforms_stay(folder):

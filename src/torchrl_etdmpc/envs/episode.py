@@ -188,8 +188,8 @@ def simulator_state(env: EnvBase) -> dict[str, Any] | None:
             return None
     state = simulator.state_dict()
     workers = list(state.values()) if isinstance(simulator, BatchedEnvBase) else [state]
-    remembered = _transform_states(env)
-    if not _is_plain(remembered) or any(worker.get("_extra_state") is None for worker in workers):
+    remembered = transform_states(env)
+    if not is_plain(remembered) or any(worker.get("_extra_state") is None for worker in workers):
         return None
     return {**state, _TRANSFORMS: remembered} if remembered else dict(state)
 
@@ -223,10 +223,10 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
         _load_transform_states(env, state.get(_TRANSFORMS, {}))
     except (RuntimeError, LookupError):  # made in another way than the one that was saved
         return False
-    return _equal(simulator_state(env), state)
+    return equal_states(simulator_state(env), state)
 
 
-def _transform_states(env: EnvBase) -> dict[str, Any]:
+def transform_states(env: EnvBase) -> dict[str, Any]:
     """What the transforms remember, of those that do: buffers and extra state, not the weights of networks."""
     states = {}
     for place, transform in enumerate(transforms_of(env)):
@@ -249,14 +249,17 @@ def _load_transform_states(env: EnvBase, states: dict[str, Any]) -> None:
         transform.load_state_dict(copy.deepcopy(state), strict=False)  # its weights stay
 
 
-def _is_plain(state: Any) -> bool:
+def is_plain(state: Any) -> bool:
     """Whether a file of weights alone may hold it."""
     if isinstance(state, dict):
-        return all(_is_plain(part) for part in state.values())
+        return all(is_plain(part) for part in state.values())
     return state is None or isinstance(state, Tensor | str | int | float)
 
 
-def _equal(one: Any, other: Any) -> bool:
+def equal_states(one: Any, other: Any) -> bool:
+    """Whether two states hold the same, to the last bit."""
     if isinstance(one, dict):
-        return isinstance(other, dict) and one.keys() == other.keys() and all(_equal(one[k], other[k]) for k in one)
+        return (
+            isinstance(other, dict) and one.keys() == other.keys() and all(equal_states(one[k], other[k]) for k in one)
+        )
     return torch.equal(one, other) if isinstance(one, Tensor) else one == other

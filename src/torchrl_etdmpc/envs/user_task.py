@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter
 
+from torchrl_etdmpc.envs.episode import equal_states, is_plain, transform_states
 from torchrl_etdmpc.envs.layers import simulator_of, transforms_of, wrappers_of
 from torchrl_etdmpc.envs.make import find_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
@@ -24,6 +25,8 @@ __all__ = ["import_attribute", "import_task"]
 
 _returned: dict[str, weakref.WeakSet[EnvBase]] = {}
 """By the path to a function, the simulators that it has returned."""
+_first_states: dict[str, dict[str, Any]] = {}
+"""By the path to a function, what the transforms around its first environment held."""
 
 
 def import_task(
@@ -69,6 +72,7 @@ def import_task(
         task = dataclasses.replace(found, name=path, **told)
     else:
         maker = partial(_make_limited, found)
+        _first_states.pop(path, None)
         env = _call(found, path)
         repeat, limit = _action_repeat(env), _limit(env)
         if limit is None and "episode_length" not in told:
@@ -181,7 +185,22 @@ def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
             "and evaluation would step the same."
         )
     before.add(simulator)
+    _require_same_numbers(path, env)
     return env
+
+
+def _require_same_numbers(path: str, env: EnvBase) -> None:
+    """Refuses statistics that every call measures anew, as ObservationNorm does by steps that it takes at random."""
+    states = transform_states(env)
+    first = _first_states.setdefault(path, states)
+    for place, transform in enumerate(transforms_of(env)):
+        one, other = first.get(str(place)), states.get(str(place))
+        if is_plain(one) and is_plain(other) and not equal_states(one, other):
+            raise ValueError(
+                f"task {path!r}: {type(transform).__name__} has other numbers in every environment that is made, so "
+                "training and evaluation would see different ones; give it fixed numbers, or leave it out and set "
+                "model.normalize_observations=true, whose statistics are the agent's."
+            )
 
 
 def _action_repeat(env: EnvBase) -> int:
