@@ -38,6 +38,7 @@ from torchrl_etdmpc import (
     LatentEnv,
     NonFiniteError,
     SeedPolicy,
+    SimulatorError,
     StepCollector,
     StepSliceSampler,
     WorldModel,
@@ -451,6 +452,35 @@ def test_more_than_one_batch_dimension_is_refused():
     env = SerialEnv(2, lambda: SerialEnv(2, LineEnv))
     with pytest.raises(ValueError, match=r"at most one batch dimension, got torch.Size\(\[2, 2\]\)"):
         StepCollector(env, RandomActions(), replay_buffer=make_replay())
+
+
+class FailingReset(LineEnv):
+    """Every second reset fails."""
+
+    def _reset(self, tensordict=None):
+        if self.resets % 2:
+            self.resets += 1
+            raise RuntimeError("no answer")
+        return super()._reset(tensordict)
+
+
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_a_reset_that_fails_costs_no_end_of_an_episode(insertion, num_envs):
+    replay, faults = make_replay(), 0
+    env = FailingReset(3) if num_envs == 1 else SerialEnv(2, [partial(FailingReset, 3), partial(LineEnv, 5)])
+    collector = StepCollector(env, RandomActions(), replay_buffer=replay, insertion=insertion)
+    for _ in range(12):
+        try:
+            collector.step()
+        except SimulatorError:
+            faults += 1
+    rows = episodes(replay.storage[:])
+    assert faults == 4 or (faults == 3 and num_envs == 2)
+    for steps in rows.values():
+        assert len(steps) == 3
+        assert [row["next", "done"].item() for row in steps] == [False, False, True]
+    assert collector.frames == num_envs * (12 - faults)
 
 
 @pytest.mark.parametrize("chosen", [None, ExplorationType.DETERMINISTIC])

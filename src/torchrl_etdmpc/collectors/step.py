@@ -63,7 +63,8 @@ class StepCollector(BaseCollector):
         NonFiniteError: while iterating, if an observation, a reward or an action is not finite. The step is not
             stored, the running episodes end at their last step, as truncated ones, and collection can go on with
             fresh ones.
-        SimulatorError: while iterating, if the environment raises; the same holds.
+        SimulatorError: while iterating, if the environment raises; the same holds. Where it raises in the reset after
+            the end of an episode, the step that ended it is stored.
 
     >>> from torchrl.data import LazyTensorStorage
     >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
@@ -197,12 +198,26 @@ class StepCollector(BaseCollector):
         try:
             return method(*args)
         except Exception as error:
+            self._store_before_reset(*args)
             self._truncate_episodes()
             with contextlib.suppress(Exception):  # then the next step fails as well, and the run ends after a few
                 start_workers_anew(self.env)
             raise SimulatorError(
                 f"the environment failed at decision step {self._frames}: {first_line(error)}"
             ) from error
+
+    def _store_before_reset(self, acted: TensorDictBase | None = None) -> None:
+        """Stores a step that was made where only the reset behind it failed, or ends of episodes would be lost.
+
+        It is not counted, as a step that fails is not. Processes do not tell what they did before they failed.
+        """
+        if acted is None or acted.get(("next", "done"), None) is None or not acted["next", "done"].any():
+            return
+        kept = acted.exclude(*self.exclude_keys)
+        values = (acted.get(key, None) for key in self._checked_after)
+        finite = all(value is not None and bool(value.isfinite().all()) for value in values)
+        if finite and set(kept.keys(True, True)) == self._schema.get(self.in_seed_phase):
+            self._store(kept, acted.get(TRAJECTORY))
 
     def _act(self, tensordict: TensorDictBase, seeding: bool) -> TensorDictBase:
         policy = self.seed_policy if seeding else self.policy
