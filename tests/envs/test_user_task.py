@@ -22,7 +22,7 @@ _MORE = """
 import gymnasium
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
-from torchrl.envs import ObservationNorm, RewardScaling
+from torchrl.envs import CatFrames, ObservationNorm, RewardScaling
 from torchrl.envs.transforms import VecNormV2
 from torchrl_etdmpc.envs import Task, make_env, register_task
 
@@ -46,6 +46,10 @@ def frozen():
 def standardised():
     env = scaled(ObservationNorm(in_keys=["observation"]), StepCounter(30))
     env.transform[1].init_stats(5)
+    return env
+def stacked():
+    env = scaled(CatFrames(2, dim=-1, in_keys=["observation"]), StepCounter(30))
+    env.rollout(3)  # which leaves other frames in every copy
     return env
 def standardised_by_constants(): return scaled(ObservationNorm(1.0, 2.0, in_keys=["observation"]), StepCounter(30))
 def normed_by_gymnasium():
@@ -347,7 +351,8 @@ def test_statistics_that_every_copy_measures_for_itself_are_refused(folder, name
         "evaluation would see different ones; give it fixed numbers, or leave it out and set "
         "model.normalize_observations=true, whose statistics are the agent's."
     )
-    make_env(import_task("more_tasks:standardised_by_constants"), num_envs=num_envs, parallel=False).reset()
+    for name in ("standardised_by_constants", "stacked"):
+        make_env(import_task(f"more_tasks:{name}"), num_envs=num_envs, parallel=False).reset()
 
 
 def test_a_users_own_transforms_stay(folder):

@@ -13,7 +13,8 @@ from functools import partial
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase, FrameSkipTransform, StepCounter
+from torchrl.envs import EnvBase, FrameSkipTransform, ObservationNorm, StepCounter, VecNorm
+from torchrl.envs.transforms import VecNormV2
 
 from torchrl_etdmpc.envs.episode import equal_states, is_plain, transform_states
 from torchrl_etdmpc.envs.layers import simulator_of, transforms_of, wrappers_of
@@ -190,12 +191,16 @@ def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
 
 
 def _require_same_numbers(path: str, env: EnvBase) -> None:
-    """Refuses statistics that every call measures anew, as ObservationNorm does by steps that it takes at random."""
+    """Refuses statistics that every call measures anew, as ObservationNorm does by steps that it takes at random.
+
+    Of other transforms that remember, e.g. the last frames, copies may differ.
+    """
     states = transform_states(env)
     first = _first_states.setdefault(path, states)
     for place, transform in enumerate(transforms_of(env)):
         one, other = first.get(str(place)), states.get(str(place))
-        if is_plain(one) and is_plain(other) and not equal_states(one, other):
+        measures = isinstance(transform, ObservationNorm | VecNorm | VecNormV2)
+        if measures and is_plain(one) and is_plain(other) and not equal_states(one, other):
             raise ValueError(
                 f"task {path!r}: {type(transform).__name__} has other numbers in every environment that is made, so "
                 "training and evaluation would see different ones; give it fixed numbers, or leave it out and set "
