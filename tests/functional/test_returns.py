@@ -205,6 +205,12 @@ def test_bootstrapped_returns_end_where_the_steps_cease_to_count(length):
     torch.testing.assert_close(bootstrapped_returns(rewards, values, 0.9, counts=counts)[:length], short)
 
 
+def test_nothing_is_bootstrapped_where_the_last_step_that_counts_terminates():
+    rewards, values = torch.ones(3), torch.full((3,), 100.0)
+    ends = {"terminated": torch.tensor([False, True, False]), "counts": torch.tensor([True, True, False])}
+    assert bootstrapped_returns(rewards, values, 0.5, **ends)[:2].tolist() == [1.5, 1.0]
+
+
 def test_a_task_without_a_time_limit_has_the_largest_discount():
     assert discount_from_episode_length(float("inf")) == discount_from_episode_length(1e300) == 0.995
     assert discount_from_episode_length(float("inf"), discount_max=1.0) == 1.0

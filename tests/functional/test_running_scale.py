@@ -113,5 +113,11 @@ def test_half_precision_has_a_scale_too(dtype):
     assert scale.item() == pytest.approx(90, abs=1)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_the_ranks_of_half_precision_are_those_of_single_precision(dtype):
+    scale, batch = torch.tensor(1.0), torch.linspace(0, 1000, 37, dtype=dtype)
+    assert updated_scale(scale, batch, tau=1.0) == updated_scale(scale, batch.float(), tau=1.0)
+
+
 def test_an_empty_batch_leaves_it_where_it_is():
     assert updated_scale(torch.tensor(3.0), torch.zeros(0), tau=0.5).item() == 3

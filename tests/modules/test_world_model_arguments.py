@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from torchrl_etdmpc import functional
-from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 
 O, A, L = 5, 2, 16  # noqa: E741
 
@@ -62,8 +62,10 @@ def test_an_unknown_activation_is_refused_with_the_choices(build):
         build(activation="gelu")
 
 
-def test_the_activation_reaches_every_network(build):
-    mish, relu = build(termination=True), build(termination=True, activation="relu")
+@pytest.mark.parametrize("kind", [WorldModel, ActionValueWorldModel])
+def test_the_activation_reaches_every_network(kind):
+    options = {"latent_dim": L, "mlp_dim": 16, "termination": True}
+    mish, relu = kind(O, A, **options), kind(O, A, activation="relu", **options)
     relu.load_state_dict(mish.state_dict())
     networks = [name for name, _ in mish.named_children()]
     assert networks == ["encoder", "dynamics", "reward_head", "value_head", "policy", "termination_head"]

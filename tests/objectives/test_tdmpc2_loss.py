@@ -221,6 +221,15 @@ def test_dropout_is_active_in_training_in_the_trained_heads_and_never_in_targets
     assert training["policy_value"] != evaluation["policy_value"]
 
 
+def test_the_policy_learns_from_values_with_dropout_and_is_evaluated_without(batch):
+    # Both heads, and actions without spread: dropout alone is left to chance.
+    loss = make_loss(make_model(dropout=0.5, num_values=2, log_std_min=-40.0, log_std_max=-39.0))
+    first, second = (evaluate(loss, batch, seed)["policy_value"] for seed in (1, 2))
+    assert (first - second).abs() > 1e-3
+    loss.eval()
+    torch.testing.assert_close(*(evaluate(loss, batch, seed)["policy_value"] for seed in (1, 2)))
+
+
 @pytest.mark.parametrize("head", [True, False])
 def test_a_replayed_termination_ends_the_bootstrap_where_the_task_terminates(batch, head):
     loss = make_loss(make_model(termination=head)).eval()
@@ -343,6 +352,20 @@ def test_new_weights_are_made_by_no_update(batch):
     loss.reset_parameters_recursive()
     assert loss.world_model.version == 0
     torch.testing.assert_close(loss.target_value_params.data, loss.value_params.data)
+
+
+def test_every_option_arrives():
+    coefs = {"consistency_coef": 2.0, "reward_coef": 3.0, "value_coef": 4.0, "termination_coef": 5.0}
+    options = coefs | {"policy_coef": 6.0, "entropy_coef": 0.5, "scale_tau": 0.25, "rho": 0.75, "reduction": "sum"}
+    loss = make_loss(make_model(termination=True), **options)
+    assert {name: getattr(loss, name) for name in options} == options
+
+
+def test_drawing_new_weights_begins_the_running_scale_anew():
+    loss = make_loss()
+    loss.q_scale.fill_(50)
+    loss.reset_parameters_recursive()
+    assert loss.q_scale == 1
 
 
 @pytest.mark.parametrize("cls", [EfficientTDMPCLoss, EfficientTDMPCValueLoss])

@@ -4,7 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_etdmpc import Plan
+from torchrl_etdmpc import Plan, WorldModel
+from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.testing import LineWorld
 
 _WIDE = {"proposal_log_std_min": -2.0, "proposal_log_std_max": 1.0}
@@ -173,3 +174,10 @@ def test_the_noise_is_standard(make_planner):
     assert noise.elite.max() < 1
     assert noise.elite.mean().item() == pytest.approx(0.5, abs=0.06)
     assert {draw.dtype for draw in noise} == {torch.float64}
+
+
+@pytest.mark.parametrize("kind", [WorldModel, ActionValueWorldModel])
+def test_states_candidates_and_steps_share_no_draw(make_planner, kind):
+    noise = make_planner(kind(3, 2, latent_dim=16, mlp_dim=16).double()).draw_noise(5)
+    for draw in noise:
+        assert len(draw.unique()) == draw.numel()

@@ -73,6 +73,11 @@ def test_a_reset_takes_a_latent_as_it_is():
     assert torch.equal(start["latent"], latent)
 
 
+def test_a_latent_comes_before_an_observation_beside_it():
+    start = TensorDict({"latent": torch.rand(4, 16), "observation": torch.rand(4, 3)}, batch_size=[4])
+    assert torch.equal(LatentEnv(make_model()).reset(start.clone())["latent"], start["latent"])
+
+
 def test_a_reset_from_nothing_encodes_zeros_in_the_batch_that_is_asked_for():
     model = make_model()
     env = LatentEnv(model)

@@ -306,6 +306,13 @@ def test_nothing_is_planned_while_disabled_and_the_interval_starts_when_enabled(
     assert len(reanalyze.planner.calls) == 1
 
 
+def test_a_single_row_that_is_read_is_no_sample():
+    buffer = make_buffer(20)
+    reanalyze = make_reanalyze(buffer)
+    assert buffer[3]["plan", "value"].item() == pytest.approx(0.3)
+    assert reanalyze.samples == len(reanalyze.planner.calls) == 0
+
+
 @pytest.mark.parametrize("outside", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC, ExplorationType.MODE])
 def test_the_planner_explores_whatever_the_caller_does(outside):
     buffer = make_buffer(40)

@@ -245,6 +245,15 @@ def test_an_id_that_comes_back_after_the_end_of_its_episode_is_another_episode()
     assert _drawn(buffer, 2) == {(0, 1), (1, 2), (3, 4)}
 
 
+def test_an_id_that_comes_back_after_a_fault_ended_its_episode_is_another_episode():
+    buffer = _buffer(2)
+    buffer.extend(_rows([7, 7, 7]))
+    buffer.sample(2)  # the episode has been followed
+    buffer.sampler.end_episodes(2, buffer.storage)
+    buffer.extend(_rows([7, 7], t=torch.arange(3, 5)))
+    assert _drawn(buffer, 2) == {(0, 1), (1, 2), (3, 4)}
+
+
 def test_two_collectors_in_a_row_that_both_count_from_zero_are_told_apart_by_their_first_steps():
     buffer = _buffer(2)
     buffer.extend(_rows([0, 0, 0], init=[0]))
@@ -729,6 +738,14 @@ def test_partial_slices_know_the_ends_after_loading_and_after_the_ring_has_turne
     assert torch.equal(again.sample(9000)["t"], expected["t"])
     first = expected["t"].reshape(-1, 3)[:, 0].unique().tolist()
     assert first == list(range(72, 120))
+
+
+def test_partial_slices_know_the_ends_when_the_table_has_been_packed():
+    buffer = _buffer(3, partial=True)
+    for begin in range(0, 600, 4):  # past several packings
+        buffer.extend(_rows([begin] * 4, done=[3], t=torch.arange(begin, begin + 4)))
+        first = buffer.sample(9000)["t"].reshape(-1, 3)[:, 0].unique().tolist()
+        assert first == list(range(max(begin - 46, 0), begin + 4))
 
 
 def test_partial_slices_need_the_ends():

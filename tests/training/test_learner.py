@@ -216,3 +216,11 @@ def test_the_counts_of_a_learner_are_its_state(tmp_path, tiny_config, make_run):
     row = other.pop_row()
     assert (row["loss"], row["simulator_faults"]) == (2, 5)
     assert len(list(other.pretrain())) == 7 - 3
+
+
+@pytest.mark.parametrize(("hold", "different"), [(1.0, 4), (1e9, 1)])
+def test_the_random_phase_holds_its_actions_as_long_as_it_is_said(tmp_path, hold, different, tiny_config, make_run):
+    learner = make_run(tiny_config(replay={"seed_hold": hold}), tmp_path).learner
+    for _ in range(4):
+        learner.step()
+    assert len(learner.replay.storage[:]["action"].unique(dim=0)) == different

@@ -640,6 +640,8 @@ def test_a_policy_gradient_that_is_not_finite_stops_the_policy_alone():
     usual_weights = dict(usual.loss.world_model.named_parameters())
     for name, weight in world_model.named_parameters():
         assert torch.equal(weight, before[name] if name.startswith("policy") else usual_weights[name]), name
+    for (target, _), (expected, _) in zip(targets_and_values(updater), targets_and_values(usual), strict=True):
+        assert torch.equal(target, expected)
     assert updater.loss.kl_scale.isfinite()
     seeded_step(updater, bad)
     assert (int(updater.skipped), int(updater.skipped_in_a_row)) == (2, 2)
