@@ -106,7 +106,7 @@ def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
     return env
 
 
-def _set_seed(set_seed: Callable[..., int], seed: int, static_seed: bool = False) -> int:
+def _set_seed(set_seed: Callable[..., int | None], seed: int | None = None, static_seed: bool = False) -> int | None:
     """Seeds a worker's environment, and what its simulator may draw from besides: the process is the worker's alone."""
     np.random.seed(seed)
     random.seed(seed)
