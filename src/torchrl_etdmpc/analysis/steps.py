@@ -48,7 +48,7 @@ def returns_at(
         tasks (sequence of str): the compared tasks.
         methods (sequence of str): of the curves; those of the points come behind them.
         evaluated (collection of tuple, optional): method, task and env steps of the estimates in which nothing is
-            interpolated, see :func:`evaluated_cells`. Default: all.
+            interpolated. Default: all.
 
     Returns:
         DataFrame: a row for every value that exists, ``env_steps, method, task, mean, standard_error, lower, upper,
