@@ -172,6 +172,7 @@ def test_the_largest_falls_are_those_of_the_committed_curves(monkeypatch, tmp_pa
     }
     committed = falls["OUT"].read_text()
     falls["main"].__globals__["OUT"] = tmp_path / "falls.csv"
+    monkeypatch.setattr(sys, "argv", ["falls.py"])
     falls["main"]()
     assert (tmp_path / "falls.csv").read_text() == committed
     study = (ROOT / "docs" / "studies" / "stability.md").read_text(encoding="utf-8")
