@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -150,12 +151,19 @@ def test_a_run_that_fails_is_tried_again_and_then_named(stand_in_script, submit,
     assert requeued(tmp_path) == []
 
 
+@contextlib.contextmanager
+def locked(run):
+    """As if another process trained it."""
+    run.path.mkdir(parents=True, exist_ok=True)
+    with open(run.path / ".lock", "w") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)
+        yield
+
+
 def test_a_run_that_another_process_trains_is_waited_for(stand_in_script, submit, small, tmp_path, monkeypatch):
     monkeypatch.setattr(slurm, "_LOOK_AGAIN_S", 0.05)
     runs, script = stand_in_script({}, retries=0)
-    runs[0].path.mkdir(parents=True, exist_ok=True)
-    with open(runs[0].path / ".lock", "w") as lock:
-        fcntl.lockf(lock, fcntl.LOCK_EX)
+    with locked(runs[0]):
         process = submit(script, 0)
         deadline = time.monotonic() + 30
         while not log_file(runs[0]).exists() or small.log_of(runs[0]).count("suite: begun") < 3:
@@ -169,9 +177,7 @@ def test_a_run_that_another_process_trains_is_waited_for(stand_in_script, submit
 
 def test_a_job_that_waits_for_another_process_leaves_when_it_is_told(stand_in_script, submit, small, tmp_path):
     runs, script = stand_in_script({}, retries=0)
-    runs[0].path.mkdir(parents=True, exist_ok=True)
-    with open(runs[0].path / ".lock", "w") as lock:
-        fcntl.lockf(lock, fcntl.LOCK_EX)
+    with locked(runs[0]):
         process = submit(script, 0)
         deadline = time.monotonic() + 30
         while not log_file(runs[0]).exists() or "in use" not in log_file(runs[0]).read_text():

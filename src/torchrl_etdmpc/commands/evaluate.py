@@ -16,13 +16,13 @@ from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
 from torchrl_etdmpc.envs.layers import simulator_of
+from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import write_film
 from torchrl_etdmpc.runs.files import make_folder_of, write_whole
 from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
 from torchrl_etdmpc.training.config import MOST_EPISODES
-from torchrl_etdmpc.training.seeding import seed_everything
 
 GIF_SIZE = 200  # pixels, for a page
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks

@@ -6,7 +6,6 @@ import contextlib
 import multiprocessing
 import multiprocessing.connection
 import os
-import random
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,11 +13,11 @@ from functools import partial
 from multiprocessing import resource_tracker
 from typing import Any, TextIO
 
-import numpy as np
 import torch
 from torchrl.envs import EnvBase, ParallelEnv
 
 from torchrl_etdmpc.envs.layers import simulator_of
+from torchrl_etdmpc.envs.seeding import seed_everything
 
 # How long a worker process may take for a step, in seconds.
 _PATIENCE_S = 300
@@ -108,8 +107,8 @@ def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:
 
 def _set_seed(set_seed: Callable[..., int | None], seed: int | None = None, static_seed: bool = False) -> int | None:
     """Seeds a worker's environment, and what its simulator may draw from besides: the process is the worker's alone."""
-    np.random.seed(seed)
-    random.seed(seed)
+    if seed is not None:
+        seed_everything(seed)
     return set_seed(seed, static_seed=static_seed)
 
 

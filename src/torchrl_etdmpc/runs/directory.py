@@ -18,6 +18,8 @@ from torchrl_etdmpc.runs.files import DamagedFileError, read_whole, write_whole
 
 _CONFIG_BYTES = 2**20
 _SEAL = "# what this run trains with, as it was written: sha256 "
+IN_USE = "is in use by another process"
+"""What who finds the directory locked is told; a suite looks for it at the end of a run's log."""
 
 
 class RunDirectory:
@@ -267,9 +269,7 @@ class RunDirectory:
                 if time.monotonic() < patience:  # somebody may just be asking whether it is in use
                     time.sleep(0.05)
                     continue
-                raise OSError(
-                    f"run_dir={self} is in use by another process; wait for it or choose another run_dir."
-                ) from error
+                raise OSError(f"run_dir={self} {IN_USE}; wait for it or choose another run_dir.") from error
             except OSError:  # a file system without locks
                 os.close(descriptor)
                 return

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.runs.directory import IN_USE
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.suites.experiment import Run
 from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, preset
@@ -21,8 +22,6 @@ Verdict = Literal["failed", "pruned"]
 BEGUN = "suite: begun"
 BELOW_MEDIAN = "below the median of the trials before it"
 FAILED = "suite: failed: "
-IN_USE = "is in use by another process"
-"""What a process says that finds the directory locked."""
 _VERDICTS: dict[Verdict, str] = {"failed": FAILED, "pruned": "suite: pruned: "}
 _TAIL_BYTES = 16_384
 

@@ -7,8 +7,9 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_etdmpc.runs.directory import IN_USE
 from torchrl_etdmpc.runs.files import write_whole
-from torchrl_etdmpc.suites.attempt import BEGUN, FAILED, IN_USE, command, log_file
+from torchrl_etdmpc.suites.attempt import BEGUN, FAILED, command, log_file
 from torchrl_etdmpc.suites.experiment import Run
 from torchrl_etdmpc.training import EXIT_CODE
 

@@ -14,9 +14,9 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import Episodes, evaluate
+from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.training.agent import Agent
-from torchrl_etdmpc.training.seeding import seed_everything
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from torchrl import torchrl_logger
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.training.agent_file import read_agent_file
@@ -24,7 +25,6 @@ from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 from torchrl_etdmpc.training.distributed import DistributedConfig, is_distributed
 from torchrl_etdmpc.training.estimate import what_it_takes
-from torchrl_etdmpc.training.seeding import seed_everything
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
 from torchrl_etdmpc.training.train import TrainingRun
 

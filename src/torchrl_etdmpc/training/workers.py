@@ -22,6 +22,7 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_etdmpc.collectors import SeedPolicy
 from torchrl_etdmpc.envs import import_task, make_env
+from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.envs.worker import signals_held_back, take_signals
 from torchrl_etdmpc.keys import WORKER
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
@@ -29,7 +30,6 @@ from torchrl_etdmpc.runs import first_line
 from torchrl_etdmpc.training.agent import build_planner, build_world_model
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 from torchrl_etdmpc.training.own_code import follow_own_code
-from torchrl_etdmpc.training.seeding import seed_everything
 
 Engine = Literal["multi", "ray"]
 
