@@ -16,6 +16,7 @@ from torchrl_etdmpc.inspector import Cancelled, TraceError, add_simulation, load
 from torchrl_etdmpc.inspector.trace import principal_components
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc.planners.imagination import imagined_returns
 from torchrl_etdmpc.testing import LineWorld, LQRWorld
 
 OBSERVATION = torch.tensor([0.1, -0.2, 0.3])
@@ -78,6 +79,23 @@ def test_what_does_not_come_from_the_search_is_what_the_planner_would_say():
     after = model.next(latent[None], torch.from_numpy(trace["chosen_actions"][0]))  # [F, L]
     first = trace["chosen_rewards"][0][:, None] + planner.discount * model.values(after).detach().numpy()
     np.testing.assert_allclose(first, trace["chosen_returns"][0], atol=1e-4)
+
+
+def test_the_policy_and_the_chosen_sequence_are_scored_in_the_dtype_of_the_candidates():
+    model = make().world_model
+    for weight in model.parameters():  # those of rewards and values are zeros at first
+        torch.nn.init.normal_(weight, std=0.3)
+    settings = {"eval_first_action": "mean", "score": "final"}
+    trace = trace_plan(make(model, scoring_dtype="bfloat16", **settings), OBSERVATION)
+    whole = trace_plan(make(model, **settings), OBSERVATION)["policy_returns"]
+    latent = model.encode(OBSERVATION)[None].bfloat16()
+    for weight in model.parameters():  # the bins stay as they are
+        weight.data = weight.data.bfloat16()
+    for name, actions in {"policy": trace["policy_actions"], "chosen": trace["chosen_actions"][None]}.items():
+        options = {"discount": 0.99, "all_depths": False, "dtype": torch.float32}
+        half = imagined_returns(model, latent, torch.from_numpy(actions)[None].bfloat16(), **options)[0]
+        np.testing.assert_allclose(trace[f"{name}_returns"].reshape(half.shape), half.detach().numpy(), rtol=1e-6)
+    assert not np.allclose(trace["policy_returns"], whole, rtol=1e-4)
 
 
 def test_points_are_projections_of_each_head_s_latents():

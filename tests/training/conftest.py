@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from torchrl.envs import EnvBase, StepCounter, Transform
+from torchrl.envs import EnvBase, Transform
 
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog
@@ -22,6 +22,7 @@ def _tiny_config(**changes: Any) -> TrainConfig:
     values: dict[str, Any] = {
         "task": "cartpole-balance",
         "preset": "cpu",
+        "episode_length": 2 * EPISODE,
         "total_env_steps": 160,
         "compile": "off",
         "eval_every": 80,
@@ -46,7 +47,7 @@ def _make_run(config: TrainConfig, run_dir: Path, *transforms: Transform, resume
 
     def make(num_envs: int, seed: int, *more: Transform) -> EnvBase:
         env = make_env(config.task_spec, seed=seed, num_envs=num_envs, parallel=False)
-        for transform in (StepCounter(EPISODE), *more):
+        for transform in more:
             env = env.append_transform(transform)
         return env
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import Transform
+from torchrl.envs import StepCounter, Transform
 
 pytest.importorskip("dm_control")
 
@@ -186,6 +186,35 @@ def test_a_task_that_terminates_although_it_is_said_not_to_is_an_error(tmp_path,
     with pytest.raises(ValueError) as caught:
         learner.step()
     assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_first_episodes_that_are_cut_before_the_told_limit_are_told_once(tmp_path, num_envs, tiny_config, make_run):
+    config = tiny_config(num_envs=num_envs, total_env_steps=160 * num_envs)
+    learner = make_run(config, tmp_path, StepCounter(8)).learner
+    for _ in range(7):
+        learner.step()
+    expected = (
+        "an episode of cartpole-balance was truncated within its first 16 env steps, but its time limit is said to be "
+        "40, by which the discount is chosen; if it is shorter, say so (task.episode_length)."
+    )
+    with pytest.warns(UserWarning) as told:
+        learner.step()
+    assert [str(warning.message) for warning in told] == [expected]
+    for _ in range(40):  # with warnings as errors
+        learner.step()
+
+
+def test_an_episode_of_full_length_is_not_told(tmp_path, tiny_config, make_run):
+    learner = make_run(tiny_config(), tmp_path, StepCounter(EPISODE)).learner
+    for _ in range(2 * EPISODE):  # with warnings as errors
+        learner.step()
+
+
+def test_no_limit_is_told_where_the_discount_does_not_follow_from_it(tmp_path, tiny_config, make_run):
+    learner = make_run(tiny_config(loss={"discount": 0.9}), tmp_path, StepCounter(8)).learner
+    for _ in range(8):  # with warnings as errors
+        learner.step()
 
 
 @pytest.mark.parametrize(("termination", "head"), [(None, True), (False, False)])

@@ -497,6 +497,21 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         stacked = (torch.stack(field, dim=1) for field in zip(*search.steps, strict=True))
         return Plan(*outputs, trace=PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
 
+    @torch.no_grad()
+    def imagined_returns(self, latent: Tensor, actions: Tensor) -> Tensor:
+        """The return table that sequences are scored by, in the dtype of scoring (thesis Eq. 3.1).
+
+        With an :class:`~torchrl_etdmpc.modules.ActionValueModel` by its values of the state, without a draw.
+
+        Args:
+            latent (Tensor): states, ``[B, L]``.
+            actions (Tensor): sequences in [-1, 1], ``[B, N, H, A]``.
+
+        Returns:
+            Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for a score of the last depth.
+        """
+        return self._imagined_returns(latent, actions, self._cast_weights(latent), None)
+
     def _initial(self, latent: Tensor, start: Tensor) -> Gaussian:
         """The Gaussian ``[B, H, A]`` of the first candidates; ``start`` is the warm start."""
         if self.initial == "wide" or not has_policy(self.world_model):
@@ -583,18 +598,10 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         iteration: int,
     ) -> tuple[Tensor, Tensor]:
         """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]`` from ``[B, L]``."""
-        options: dict[str, Any] = {"discount": self.discount, "all_depths": self.score.depths == "all"}
+        bootstrap = None
         if noise.heads.shape[-1]:
-            drawn = noise.bootstrap[:, iteration, -actions.shape[1] :]
-            if weights_cast is not None:
-                drawn = drawn.to(self.scoring_dtype)
-            options["bootstrap"] = drawn, noise.heads[:, iteration]
-        if weights_cast is None:
-            returns = self._imagination(latent, actions, **options)
-        else:
-            inputs = latent.to(self.scoring_dtype), actions.to(self.scoring_dtype)
-            options["dtype"] = latent.dtype
-            returns = functional_call(self._imagination, weights_cast, inputs, options)
+            bootstrap = noise.bootstrap[:, iteration, -actions.shape[1] :], noise.heads[:, iteration]
+        returns = self._imagined_returns(latent, actions, weights_cast, bootstrap)
         scores = self.score(returns)
         if scores.shape != actions.shape[:2]:
             raise ValueError(
@@ -602,6 +609,23 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 f"{list(scores.shape)}."
             )
         return scores, returns
+
+    def _imagined_returns(
+        self,
+        latent: Tensor,
+        actions: Tensor,
+        weights_cast: dict[str, Tensor] | None,
+        bootstrap: tuple[Tensor, Tensor] | None,
+    ) -> Tensor:
+        """The return table, by weights that are cast once for many calls."""
+        options: dict[str, Any] = {"discount": self.discount, "all_depths": self.score.depths == "all"}
+        if weights_cast is None:
+            return self._imagination(latent, actions, bootstrap=bootstrap, **options)
+        if bootstrap is not None:
+            bootstrap = bootstrap[0].to(self.scoring_dtype), bootstrap[1]
+        inputs = latent.to(self.scoring_dtype), actions.to(self.scoring_dtype)
+        options |= {"bootstrap": bootstrap, "dtype": latent.dtype}
+        return functional_call(self._imagination, weights_cast, inputs, options)
 
 
 class _Search(NamedTuple):

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
@@ -59,7 +60,7 @@ class Learner:
         self.collector = build_collector(config, self.agent, env, self.replay)
         self.pretrained = self.faults = self.faults_in_a_row = 0
         self._updates, self._decisions = IntervalMeans(), IntervalMeans()
-        self._range_noted = False
+        self._range_noted = self._limit_noted = False
 
     @property
     def env_steps(self) -> int:
@@ -126,6 +127,20 @@ class Learner:
             raise ValueError(
                 f"an episode of {self.config.task} terminated, but the task is said never to; "
                 "say task.terminates=true (model.termination=false to bootstrap through its ends)."
+            )
+        if self.config.loss.discount is None and not self._limit_noted:
+            self._note_limit(stepped.get(("next", "truncated"), None))
+
+    def _note_limit(self, truncated: Tensor | None) -> None:
+        """Says once that first episodes are cut before the time limit that the discount is chosen by."""
+        task, decisions = self.config.task_spec, self.collector.frames // self.config.num_envs
+        if truncated is not None and decisions < task.decision_steps_per_episode and truncated.any():
+            self._limit_noted = True
+            warnings.warn(
+                f"an episode of {self.config.task} was truncated within its first {decisions * task.action_repeat} env "
+                f"steps, but its time limit is said to be {task.episode_length}, by which the discount is chosen; if "
+                "it is shorter, say so (task.episode_length).",
+                stacklevel=4,
             )
 
     def _count_fault(self, error: NonFiniteError | SimulatorError) -> None:

@@ -23,7 +23,7 @@ from torchrl_etdmpc.inspector.trace.progress import watched
 from torchrl_etdmpc.inspector.trace.trace import Trace, trace_of
 from torchrl_etdmpc.modules.prediction import PredictionModel, has_policy
 from torchrl_etdmpc.planners import AdaptiveScore, EnsembleMPPIPlanner, Plan, PlanNoise, PlanTrace
-from torchrl_etdmpc.planners.imagination import imagined_returns, propose_sequences
+from torchrl_etdmpc.planners.imagination import propose_sequences
 
 
 @torch.no_grad()
@@ -188,19 +188,13 @@ def _of_the_policy(planner: EnsembleMPPIPlanner, latent: Tensor) -> dict[str, Te
     heads = model.num_dynamics
     still = latent.new_zeros(1, heads, planner.horizon, model.action_dim)
     actions = propose_sequences(model, latent[None], still)
-    returns = _returns(planner, latent, actions[0])
+    returns = planner.imagined_returns(latent[None], actions)[0]
     return {
         "policy_action": model.policy(latent)[0],
         "policy_actions": actions[0],
         "policy_returns": returns,
         "policy_scores": planner.score(returns),
     }
-
-
-def _returns(planner: EnsembleMPPIPlanner, latent: Tensor, actions: Tensor) -> Tensor:
-    """Return table ``[N, D, F, V]`` of sequences ``[N, H, A]``, by the model's own values."""
-    options = {"discount": planner.discount, "all_depths": planner.score.depths == "all"}
-    return imagined_returns(planner.world_model, latent[None], actions[None], **options)[0]
 
 
 def _of_the_chosen(planner: EnsembleMPPIPlanner, latent: Tensor, actions: Tensor) -> dict[str, Tensor]:
@@ -211,6 +205,6 @@ def _of_the_chosen(planner: EnsembleMPPIPlanner, latent: Tensor, actions: Tensor
     rewards = model.reward(before, actions[:, None].expand(*before.shape[:-1], -1))
     return {
         "chosen_actions": actions,
-        "chosen_returns": _returns(planner, latent, actions[None])[0],
+        "chosen_returns": planner.imagined_returns(latent[None], actions[None, None])[0, 0],
         "chosen_rewards": rewards,
     }
