@@ -103,7 +103,8 @@ def test_the_paper_s_planners_are_built_from_its_presets_and_reanalyze_alone_is_
 
 
 def test_the_discount_follows_from_the_episode_s_length_unless_it_is_given(tiny_agent):
-    for agent, expected in ((tiny_agent(), 0.99), (tiny_agent(loss={"discount": 0.9}), 0.9)):
+    agents = tiny_agent(episode_length=None), tiny_agent(episode_length=400), tiny_agent(loss={"discount": 0.9})
+    for agent, expected in zip(agents, (0.99, 0.975, 0.9), strict=True):
         assert agent.loss.discount.item() == pytest.approx(expected)
         assert [getattr(agent, name).discount for name in PLANNERS] == pytest.approx([expected] * 3)
 
