@@ -206,9 +206,10 @@ def test_first_episodes_that_are_cut_before_the_told_limit_are_told_once(tmp_pat
 
 
 def test_an_episode_of_full_length_is_not_told(tmp_path, tiny_config, make_run):
-    learner = make_run(tiny_config(), tmp_path, StepCounter(EPISODE)).learner
+    learner = make_run(tiny_config(), tmp_path).learner
     for _ in range(2 * EPISODE):  # with warnings as errors
         learner.step()
+    assert learner.replay[:]["next", "truncated"].flatten().nonzero().flatten().tolist() == [19, 39]
 
 
 def test_no_limit_is_told_where_the_discount_does_not_follow_from_it(tmp_path, tiny_config, make_run):
