@@ -8,7 +8,7 @@ Runs stand in `runs/cpu-all`, where `examples/suite.py` goes on with interrupted
 `benchmarks/results/cpu/<task>/seed<k>` gets `eval.csv` and `summary.json`, and `train.csv` where `early_markers.py`
 reads it. `report/` sets the six tasks that the preset was tuned on beside published curves, `report-easy/` and
 `report-hard/` those of the benchmark that have runs. `README.md` then has returns and times of all that are there, and
-`docs/results.md` means over the easy tasks that it was tuned on and over the others, beside baselines.
+`docs/results.md` means over the easy tasks that it was tuned on and over the others, and every task, beside baselines.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ MARKED = ("walker-walk", "reacher-easy")
 """Tasks whose ``train.csv`` is kept."""
 SEEDS = (1, 2, 3)
 STEPS = (50_000, 100_000)
+BESIDE = ("SimbaV2-UTD8", "FoG", "DR.Q", "BMPC", "TD-MPC2")
+"""What has a mean over all easy tasks at the last step, the method's own lineage among it."""
 
 
 def run(
@@ -133,6 +135,33 @@ def beside_baselines(returns: pd.DataFrame) -> list[str]:
     ]
 
 
+def by_task(returns: pd.DataFrame, curves: pd.DataFrame) -> list[str]:
+    """Returns of single tasks at the last step, furthest ahead of the highest other mean first, as lines of Markdown.
+
+    Args:
+        returns (DataFrame): ``returns.csv`` of a report.
+        curves (DataFrame): the preset's evaluations, as of :func:`read_runs`.
+    """
+    at_end = returns[(returns["tasks"] == 1) & (returns["env_steps"] == STEPS[-1])]
+    lines = {}
+    for task, rows in at_end.groupby("task"):
+        means = rows.set_index("method")["mean"]
+        if "cpu" not in means:
+            continue
+        seeds = curves.loc[(curves["task"] == task) & (curves["env_steps"] == STEPS[-1]), "return_mean"]
+        others = means.drop("cpu")
+        cells = [
+            task,
+            f"{means['cpu']:.0f}",
+            ", ".join(f"{value:.0f}" for value in seeds),
+            f"{others.idxmax()} {others.max():.0f}",
+            *(f"{means[name]:.0f}" if name in means else "–" for name in BESIDE),
+        ]
+        lines[f"| {' | '.join(cells)} |"] = others.max() - means["cpu"]
+    heads = ["task", "**cpu**", "its seeds", "highest other", *BESIDE]
+    return [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *sorted(lines, key=lambda row: lines[row])]
+
+
 def write_readme(table: pd.DataFrame) -> None:
     """A table of returns, budgets and wall times."""
     lines = [
@@ -182,12 +211,11 @@ def write_readme(table: pd.DataFrame) -> None:
     (RESULTS / "README.md").write_text("\n".join(lines))
 
 
-def write_means(returns: pd.DataFrame) -> None:
-    """The table of :func:`beside_baselines` into the page on results."""
-    begin, end = "<!-- means: written by benchmarks/cpu_learning.py -->\n", "<!-- end -->"
+def write_table(name: str, lines: Sequence[str]) -> None:
+    """A table into its place on the page on results."""
+    begin, end = f"<!-- {name}: written by benchmarks/cpu_learning.py -->\n", "<!-- end -->"
     head, rest = PAGE.read_text(encoding="utf-8").split(begin)
-    table = "\n".join(beside_baselines(returns))
-    PAGE.write_text(f"{head}{begin}{table}\n{rest[rest.index(end) :]}", encoding="utf-8")
+    PAGE.write_text("\n".join((head + begin + lines[0], *lines[1:], rest[rest.index(end) :])), encoding="utf-8")
 
 
 def _range(values: Sequence[float]) -> str:
@@ -214,8 +242,10 @@ def main() -> None:
     write_report(TASKS, RESULTS / "report")
     for level in ("easy", "hard"):
         write_report(get_benchmark(f"dmc-{level}").tasks, RESULTS / f"report-{level}")
-    write_readme(read_runs(found))
-    write_means(pd.read_csv(RESULTS / "report-easy" / "returns.csv"))
+    curves, returns = read_runs(found), pd.read_csv(RESULTS / "report-easy" / "returns.csv")
+    write_readme(curves)
+    write_table("means", beside_baselines(returns))
+    write_table("tasks", by_task(returns, curves))
 
 
 if __name__ == "__main__":

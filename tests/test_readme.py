@@ -231,17 +231,6 @@ def test_the_means_of_the_readme_are_those_of_the_table():
     assert f"TD-MPC2 has {figure} on these six, read off a figure" in " ".join(page.split())
 
 
-def test_the_returns_of_single_tasks_are_those_of_the_committed_report():
-    returns = _returns_at_the_end("report-easy/returns.csv", "100000")
-    (text,) = re.findall(r"\*\*By task\*\*, at 100,000 env steps\.(.*?)\n\n", TEXTS["docs/results.md"], re.S)
-    quoted = re.findall(r"([a-z-]+)\s(\d+) \(([^)]*)\)", text)
-    assert len(quoted) > 4
-    for task, own, others in quoted:
-        assert returns["cpu", task][0] == own, task
-        for method, value in re.findall(r"([\w.-]+) (\d+)", others):
-            assert returns[method, task][0] == value, (method, task)
-
-
 def test_the_means_with_former_settings_are_those_that_are_committed():
     (text,) = re.findall(r"\*\*With former settings\*\*(.*?)\n\n", TEXTS["docs/results.md"], re.S)
     six = [path.name for path in (ROOT / "benchmarks" / "results" / "cpu" / "width-64").glob("*-*")]

@@ -210,12 +210,41 @@ def test_means_beside_baselines_are_over_the_tasks_that_were_run(monkeypatch):
     ]
 
 
-def test_the_means_beside_baselines_are_those_of_the_committed_report(monkeypatch):
+def test_single_tasks_stand_beside_the_highest_of_the_others(monkeypatch):
+    pd = pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    by_task = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))["by_task"]
+    rows = [
+        ("cpu", "cup-catch", 960.0),
+        ("BMPC", "cup-catch", 939.4),
+        ("FoG", "cup-catch", 970.6),
+        ("cpu", "walker-run", 600.0),
+        ("SAC", "walker-run", 340.0),
+        ("BMPC", "fish-swim", 130.0),  # which the preset was not run on
+    ]
+    columns = ["env_steps", "tasks", "method", "task", "mean"]
+    returns = pd.DataFrame([(100_000, 1, *row) for row in rows], columns=columns)
+    returns.loc[len(returns)] = (50_000, 1, "FoG", "cup-catch", 999.0)
+    returns.loc[len(returns)] = (100_000, 2, "cpu", "Mean over tasks", 780.0)
+    curves = [("cup-catch", 950.0), ("cup-catch", 970.0), ("walker-run", 600.0)]
+    curves = pd.DataFrame([(100_000, *row) for row in curves], columns=["env_steps", "task", "return_mean"])
+    assert by_task(returns, curves) == [
+        "| task | **cpu** | its seeds | highest other | SimbaV2-UTD8 | FoG | DR.Q | BMPC | TD-MPC2 |",
+        "|---|---|---|---|---|---|---|---|---|",
+        "| walker-run | 600 | 600 | SAC 340 | – | – | – | – | – |",
+        "| cup-catch | 960 | 950, 970 | FoG 971 | – | 971 | – | 939 | – |",
+    ]
+
+
+def test_the_tables_beside_baselines_are_those_of_the_committed_report(monkeypatch):
     pd = pytest.importorskip("pandas")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     script = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))
-    lines = script["beside_baselines"](pd.read_csv(script["RESULTS"] / "report-easy" / "returns.csv"))
-    assert "\n".join(lines) in script["PAGE"].read_text(encoding="utf-8")
+    returns = pd.read_csv(script["RESULTS"] / "report-easy" / "returns.csv")
+    curves = script["read_runs"](script["folders"](script["DMC_TASKS"]))
+    page = script["PAGE"].read_text(encoding="utf-8")
+    for lines in (script["beside_baselines"](returns), script["by_task"](returns, curves)):
+        assert "-->\n" + "\n".join(lines) + "\n<!-- end -->" in page
 
 
 def test_the_commands_explain_themselves(generate):
