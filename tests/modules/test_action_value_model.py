@@ -93,6 +93,21 @@ def test_both_policies_answer_alike():
     assert (mean.abs() < 1).all()
 
 
+def test_the_deviation_of_a_squashed_policy_is_that_of_its_actions():
+    torch.manual_seed(0)
+    policy = SquashedGaussianPolicy(L, A, hidden_dim=8, log_std_min=-6.0, log_std_max=-5.0).double()
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.add_(0.5 * torch.randn_like(parameter))
+    latent = torch.rand(7, L).double()
+    before, narrow = policy.before_tanh(latent)
+    mean, log_std = policy(latent)
+    assert before.abs().max() > 1  # where the tanh is far from the identity
+    actions = torch.tanh(before + narrow.exp() * torch.randn(20_000, 7, A).double())
+    torch.testing.assert_close(actions.mean(0), mean, rtol=0, atol=3e-4)
+    torch.testing.assert_close(actions.std(0), log_std.exp(), rtol=0.03, atol=0)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -166,6 +166,9 @@ def test_termination_is_a_probability_from_the_heads_logit(build, randomised):
     torch.testing.assert_close(model.termination(latent), torch.sigmoid(model.termination_head(latent)))
     fresh = build(termination=True).termination(latent)
     torch.testing.assert_close(fresh, torch.full((7,), 0.5), rtol=0, atol=0.1)
+    with torch.autocast("cpu", dtype=torch.bfloat16):  # whose steps near 1 are 1/256: survival would go in jumps
+        assert model.termination_head(latent).dtype == torch.bfloat16
+        assert model.termination(latent).dtype == torch.float32
 
 
 def test_observations_of_another_dtype_say_how_to_cast_them(build):

@@ -287,11 +287,10 @@ def test_a_metric_that_has_no_mean_is_refused(make_loss, slices, metric, kind):
         loss(slices)
 
 
-def test_a_scalar_cannot_have_the_name_of_the_loss_s_own(world_model):
-    with pytest.raises(ValueError, match="metrics and scalars must have names of their own, got 'rho'"):
-        EfficientTDMPCLoss(
-            world_model, discount=0.99, extra_terms=[Term("mine", lambda *_: None, scalars={"rho": 3.0})]
-        )
+@pytest.mark.parametrize("name", ["rho", "scale_tau", "kl_direction"])
+def test_a_scalar_cannot_have_the_name_of_the_loss_s_own(world_model, name):
+    with pytest.raises(ValueError, match=f"metrics and scalars must have names of their own, got '{name}'"):
+        EfficientTDMPCLoss(world_model, discount=0.99, extra_terms=[Term("mine", lambda *_: None, scalars={name: 0.3})])
 
 
 @pytest.mark.parametrize("coef", [float("nan"), float("inf")])

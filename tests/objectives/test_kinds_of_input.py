@@ -233,6 +233,21 @@ def test_half_precision_leaves_the_discount_as_it_is():
         assert loss.to(dtype).discount.dtype == dtype
 
 
+@pytest.mark.parametrize(("kind", "name"), [("efficient", "kl_scale"), ("tdmpc2", "q_scale")])
+def test_a_running_scale_moves_in_half_precision(kind, name):
+    sizes = {"latent_dim": 16, "mlp_dim": 16}
+    if kind == "efficient":
+        loss = EfficientTDMPCLoss(WorldModel(5, 3, **sizes), discount=0.99)
+    else:
+        loss = TDMPC2Loss(ActionValueWorldModel(5, 3, **sizes), discount=0.99)
+    loss.to(torch.bfloat16)
+    SoftUpdate(loss, tau=0.01)
+    loss.get_buffer(name).fill_(100.0)
+    batch = random_slices(5, 3, num_slices=4, slice_len=3)
+    loss(batch.apply(lambda x: x.bfloat16() if x.is_floating_point() else x))
+    assert 98.9 < loss.get_buffer(name).item() < 99.9  # towards 1 or more by a hundredth; in bfloat16 it would stay
+
+
 @pytest.mark.parametrize("training", [True, False])
 def test_no_slices_at_all_are_refused(make_loss, training):
     loss = make_loss("whole").train(training)

@@ -88,8 +88,8 @@ def test_what_an_environment_observes_and_no_term_reads_is_not_stored(tiny_confi
         return replay[:]
 
     assert stored().bytes() / 3 == row_bytes(24, 6) - 8  # the generation, kept by the writer
-    further = set(stored("step_count", ("next", "copy")).keys(True, True)) - set(stored().keys(True, True))
-    assert further == {"step_count", ("next", "copy")}
+    read = {"step_count", ("next", "copy"), "episode_reward", ("plan", "fallback")}
+    assert set(stored(*read).keys(True, True)) - set(stored().keys(True, True)) == read
 
 
 def test_a_sample_is_a_batch_of_slices(tiny_config):

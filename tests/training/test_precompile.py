@@ -10,7 +10,9 @@ import sys
 import pytest
 import torch
 
-from torchrl_etdmpc.training import build_agent, precompile
+from torchrl_etdmpc.objectives import Term
+from torchrl_etdmpc.testing import random_slices
+from torchrl_etdmpc.training import build_agent, build_replay, precompile
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler"
@@ -63,6 +65,42 @@ def test_reanalyze_is_compiled_for_as_many_rows_as_a_sample_has(tiny_config, mon
     monkeypatch.setattr(type(agent.reanalyze_planner), "forward", lambda _, states: shapes.append(states.batch_size))
     precompile._parts(config, agent, (), (1,))["reanalyze"]()
     assert shapes == [torch.Size([4 * config.loss.slice_len])]
+
+
+@pytest.mark.parametrize("terminates", [False, True])
+def test_the_graph_of_an_update_is_that_of_replayed_slices(tiny_config, terminates):
+    config = tiny_config(compile="off", terminates=terminates, optim={"batch_size": 4})
+    agent, replay = build_agent(config, 5, 1), build_replay(config)
+    rows = random_slices(5, 1, num_slices=1, slice_len=30).reshape(-1)
+    rows["collector", "traj_ids"] = torch.zeros(30, dtype=torch.int64)
+    rows["next", "done"][-1] = True
+    replay.extend(rows)
+    graphs = []
+
+    def count(graph, _):
+        graphs.append(graph)
+        return graph
+
+    torch._dynamo.reset()
+    updater = agent.updater
+    updater._compiled = torch.compile(updater._gradients, backend=count, fullgraph=True, dynamic=False)
+    precompile._parts(config, agent, (), (1,))["update"]()
+    assert len(graphs) == 1
+    updater.step(replay.sample())
+    assert len(graphs) == 1
+
+
+def test_an_update_that_reads_more_than_can_be_made_up_compiles_when_it_is_made(monkeypatch, tiny_config):
+    path = f"{__name__}:reads_the_value"
+    monkeypatch.setattr("torchrl_etdmpc.training.own_code._followed", {("loss.extra_terms", path): reads_the_value})
+    config = tiny_config(compile="off", loss={"extra_terms": path})
+    agent = build_agent(config, 5, 1)
+    agent.updater._compiled = lambda *_: pytest.fail("the batch lacks the value of plans")
+    precompile._parts(config, agent, (), (1,))["update"]()
+
+
+def reads_the_value(world_model):
+    return [Term("mine", lambda model, slices, rollout: slices.reward, keys=("reward", ("plan", "value")))]
 
 
 def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, agent):

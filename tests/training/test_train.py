@@ -458,7 +458,11 @@ def test_updates_that_stay_without_a_finite_gradient_stop_the_run_and_name_the_t
         run.run()
     agent, _, _ = load_agent(tmp_path / "checkpoints" / "last.pt")
     assert all(value.isfinite().all() for value in agent.loss.state_dict().values())
-    assert 20 <= int(run.learner.agent.updater.skipped) < 60
+    skipped = int(run.learner.agent.updater.skipped)
+    assert 20 <= skipped < 60
+    resumed = make_run(tiny_config(max_skipped=20, optim={"updates_per_decision": 1}), tmp_path, resume=True)
+    assert resumed.run() is not None  # with nothing wrong any more it has as many tries as at first
+    assert int(resumed.learner.agent.updater.skipped) == skipped
 
 
 def test_any_other_error_closes_the_environments_too(tmp_path, monkeypatch, tiny_config, make_run):

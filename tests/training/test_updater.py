@@ -14,7 +14,12 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.functional import updated_scale
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss, Term
+from torchrl_etdmpc.objectives import (
+    EfficientTDMPCLoss,
+    EfficientTDMPCModelLoss,
+    EfficientTDMPCPolicyLoss,
+    Term,
+)
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
 
@@ -288,6 +293,54 @@ def test_the_targets_move_by_tau_towards_the_new_values_after_each_update():
         for old, (target, value) in zip(before, targets_and_values(updater), strict=True):
             torch.testing.assert_close(target, (1 - TAU) * old + TAU * value, rtol=1e-12, atol=1e-14)
             assert not torch.equal(target, old)
+
+
+def test_the_targets_that_a_term_of_one_s_own_reads_move_too():
+    def term(world_model, slices, rollout):
+        return (slices.action.square().sum(-1) * next(iter(rollout.targets["encoder"].values())).mean()).detach()
+
+    networks = ("encoder", "dynamics")
+    world_model = make_world_model()
+    world_model.encoder.requires_grad_(True)
+    next(world_model.dynamics.parameters()).requires_grad_(False)
+    updater = make_updater(world_model, extra_terms=[Term("mine", term, networks=networks, targets=networks)])
+    loss = updater.loss
+    followed = {
+        name: (
+            getattr(loss, f"target_{name}_params").flatten_keys("."),
+            getattr(loss, f"{name}_params").flatten_keys("."),
+        )
+        for name in networks
+    }
+    for _ in range(3):
+        before = {name: targets.clone() for name, (targets, _) in followed.items()}
+        seeded_step(updater, make_batch())
+        for name, (targets, leaders) in followed.items():
+            for key, leader in leaders.items():
+                expected = torch.lerp(before[name][key], leader.detach(), TAU)
+                torch.testing.assert_close(targets[key], expected, rtol=1e-12, atol=1e-14)
+                assert torch.equal(targets[key], before[name][key]) != leader.requires_grad
+    targets = loss.targets()["encoder"]
+    assert all(targets[key].equal(value) for key, value in followed["encoder"][0].items())
+
+
+@pytest.mark.parametrize("kind", [EfficientTDMPCModelLoss, EfficientTDMPCPolicyLoss])
+def test_a_part_of_the_loss_can_be_trained_alone(kind):
+    loss = kind(make_world_model(termination=True))
+    updater = Updater(loss)
+    before = {name: value.clone() for name, value in loss.named_parameters()}
+    seeded_step(updater, make_batch())
+    assert all(not torch.equal(value, before[name]) for name, value in loss.named_parameters())
+
+
+def test_without_a_word_on_distillation_the_loss_decides():
+    loss = EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True)
+    updater = Updater(loss)
+    loss.distill = False
+    assert "loss_policy" not in updater.step(make_batch())
+    assert not loss.distill
+    assert "loss_policy" in updater.step(make_batch(), distill=True)
+    assert "loss_policy" in updater.step(make_batch())
 
 
 def test_the_returned_numbers_are_detached_finite_scalars():

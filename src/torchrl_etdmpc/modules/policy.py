@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchrl_etdmpc.functional import bounded_log_std
+from torchrl_etdmpc.functional import bounded_log_std, tanh_log_slope
 from torchrl_etdmpc.modules.normed_linear import Activation, LayerStack
 
 
@@ -72,8 +72,8 @@ class GaussianPolicy(LayerStack):
 class SquashedGaussianPolicy(GaussianPolicy):
     """Latent to a Gaussian that a tanh squashes into [-1, 1] (TD-MPC2, arXiv:2310.16828).
 
-    An action is ``tanh(m + std * eps)``. Called, it answers as every policy does, with ``mean = tanh(m)``, the action
-    without noise, and the log standard deviation before the tanh.
+    An action is ``tanh(m + std * eps)``. Called, it answers as every policy does, with the action without noise,
+    ``mean = tanh(m)``, and the log standard deviation of actions, ``std (1 - mean^2)`` for a small ``std``.
 
     Args:
         latent_dim (int): L.
@@ -86,6 +86,11 @@ class SquashedGaussianPolicy(GaussianPolicy):
     >>> torch.equal(policy(torch.zeros(7, 16))[0], mean.tanh())
     True
     """
+
+    def forward(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and log std of actions, to first order in the std before the tanh, to which the bounds apply."""
+        mean, log_std = self.before_tanh(latent, log_std_bounds)
+        return mean.tanh(), log_std + tanh_log_slope(mean)
 
     def before_tanh(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and log std of the Gaussian before the tanh, both of shape ``[..., A]``."""

@@ -220,7 +220,9 @@ class WorldModel(nn.Module):
 
         ``None`` without a termination head.
         """
-        return None if self.termination_head is None else self.termination_head(latent).sigmoid()
+        if self.termination_head is None:
+            return None
+        return self.termination_head(latent).to(self.bins.dtype).sigmoid()
 
     def act(self, latent: Tensor, noise: Tensor, log_std_bounds: tuple[float, float] | None = None) -> Tensor:
         """Samples the policy: ``clip(mean + std * noise, -1, 1)``, shape ``[..., A]``.

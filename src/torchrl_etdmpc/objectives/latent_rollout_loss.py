@@ -26,6 +26,7 @@ Reduction = Literal["none", "mean", "sum"]
 """What a loss makes of the errors of its steps."""
 
 _REDUCTIONS = get_args(Reduction)
+_RUNNING_SCALES = ("kl_scale", "q_scale")
 
 
 def _check_reduction(reduction: str) -> None:
@@ -193,7 +194,7 @@ class LatentRolloutLoss(LossModule):
         vars(self)["world_model"] = world_model
         self.ignore_termination = ignore_termination
         self.terms = (*terms, *extra_terms)
-        reserved = {"rho", *vars(self), *dir(type(self))}
+        reserved = {"rho", "scale_tau", "kl_direction", *vars(self), *dir(type(self))}
         check_terms(terms, extra_terms, networks=self._attributes, reserved=reserved)
         self._trained = {}
         trained = {name for term in self.terms for name in term.networks}
@@ -227,11 +228,13 @@ class LatentRolloutLoss(LossModule):
 
     def _apply(self, fn, *args, **kwargs):
         # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
-        scalars = {name: self.get_buffer(name) for name in (*self._scalars, "rho")}
+        names = (*self._scalars, "rho", *(name for name in _RUNNING_SCALES if name in self._buffers))
+        scalars = {name: self.get_buffer(name) for name in names}
         super()._apply(fn, *args, **kwargs)
         for name, exact in scalars.items():
             now = self.get_buffer(name)
-            if now.element_size() < 4:  # a discount of 0.99 is 0.988 in bfloat16
+            # In bfloat16 a discount of 0.99 is 0.988, and a scale of 10 that moves by a hundredth stays 10.
+            if now.element_size() < 4:
                 self.register_buffer(name, exact.to(now.device))
         self.__dict__["world_model"]._apply(fn)
         self._read_networks()  # a cast keeps parameters and replaces buffers
@@ -320,7 +323,7 @@ class LatentRolloutLoss(LossModule):
         for name, target in parameters.items():
             if name.startswith("target_"):
                 target.data.update_(parameters[name.removeprefix("target_")].data)
-        for name in ("kl_scale", "q_scale"):
+        for name in _RUNNING_SCALES:
             if name in self._buffers:
                 self.get_buffer(name).fill_(1)
 
@@ -329,6 +332,18 @@ class LatentRolloutLoss(LossModule):
         found: dict[str, list[nn.Parameter]] = {}
         for name, parameter in self.named_parameters():  # lists a parameter that is shared once
             found.setdefault(name.partition(".")[0].removesuffix("_params"), []).append(parameter)
+        return found
+
+    def target_parameters(self) -> dict[str, list[tuple[Tensor, nn.Parameter]]]:
+        """Each parameter of a target network and the trained one that it follows, by network."""
+        parameters: dict[str, Any] = self._modules
+        found: dict[str, list[tuple[Tensor, nn.Parameter]]] = {}
+        for name, target in parameters.items():
+            if name.startswith("target_"):
+                own = parameters[name.removeprefix("target_")]
+                pairs = [(target.get(key), own.get(key)) for key in target.keys(True, True)]
+                trained = [pair for pair in pairs if isinstance(pair[1], nn.Parameter) and pair[1].requires_grad]
+                found[name.removeprefix("target_").removesuffix("_params")] = trained
         return found
 
     @property

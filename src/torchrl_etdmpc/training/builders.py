@@ -95,17 +95,12 @@ def build_replay(
     192
     """
     rows = min(config.replay.capacity, config.total_decisions + config.num_envs)
-    partial = config.replay.partial
-    if partial is None:
-        # Departure from BMPC, whose slices lie within an episode: its last steps then never begin a slice, and what is
-        # learned of them has the least weight.
-        partial = config.task_spec.terminates
     with named_settings("loss", config.loss):
         sampler = StepSliceSampler(
             config.loss.slice_len,
             traj_key=[WORKER, TRAJECTORY] if isinstance(config, DistributedConfig) else TRAJECTORY,
             uniform_over=config.replay.uniform_over,
-            partial=partial,
+            partial=config.partial_slices,
             as_slices=True,
         )
     return TensorDictReplayBuffer(
@@ -140,7 +135,7 @@ def build_reanalyze(config: TrainConfig, agent: Agent, replay: TensorDictReplayB
 
 
 def unread_keys(env: EnvBase, agent: Agent) -> tuple[NestedKey, ...]:
-    """What is not stored: :data:`UNREAD`, and what else a user's environment observes and no term of the loss reads.
+    """What is not stored: of :data:`UNREAD` and what else a user's environment observes all that no term reads.
 
     Pixels to look at, counts, what the simulator knows: it would fill the memory, which is counted without it.
 
@@ -151,7 +146,7 @@ def unread_keys(env: EnvBase, agent: Agent) -> tuple[NestedKey, ...]:
     read = {*map(unravel_key, agent.loss.in_keys), (NEXT, "episode_reward")}
     observed = list(env.full_observation_spec.keys(True, True))
     written = [*observed, *(unravel_key((NEXT, key)) for key in observed)]
-    return (*UNREAD, *(key for key in written if key not in {*read, *UNREAD}))
+    return tuple(key for key in dict.fromkeys((*UNREAD, *written)) if key not in read)
 
 
 def build_collector(

@@ -344,6 +344,13 @@ class TrainConfig:
         return slices * self.loss.slice_len
 
     @property
+    def partial_slices(self) -> bool:
+        """Whether slices may begin in the last steps of an ended episode, so that batches are masked."""
+        # Departure from BMPC, whose slices lie within an episode: its last steps then never begin a slice, and what is
+        # learned of them has the least weight.
+        return self.task_spec.terminates if self.replay.partial is None else self.replay.partial
+
+    @property
     def pretrain_updates(self) -> int:
         """Updates between the random phase and learning."""
         return self.seed_decisions if self.replay.pretrain_updates is None else self.replay.pretrain_updates

@@ -211,9 +211,10 @@ class Learner:
         broken = [
             name for name, value in row.items() if name.startswith(("loss_", "grad_")) and not math.isfinite(value)
         ]
+        self.agent.updater.skipped_in_a_row.zero_()  # a run that goes on from here has as many new tries
         raise NonFiniteError(
             f"the last {in_a_row} updates had no finite gradient and were skipped; not finite are {', '.join(broken)}. "
-            "A lower optim.lr or optim.grad_clip_norm may help."
+            "In a new run a lower optim.lr or optim.grad_clip_norm may help."
         )
 
     def state_dict(self) -> dict[str, Any]:

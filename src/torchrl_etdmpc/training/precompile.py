@@ -149,6 +149,12 @@ def _parts(
         following["terminated"] = zeros(*slices, 1, dtype=torch.bool)
         rows = {"observation": following["observation"], "action": action, "next": following}
         rows["plan"] = {"loc": action, "scale": action + 1}
-        agent.updater.warm_up(TensorDict(rows, slices))
+        if config.partial_slices:
+            rows["collector"] = {"mask": zeros(*slices, dtype=torch.bool).logical_not()}
+        made_up = TensorDict(rows, slices)
+        # What a term of the user's own reads beside these has a shape that only the buffer knows: the first update
+        # compiles.
+        if set(agent.loss.in_keys) <= set(made_up.keys(True, True)):
+            agent.updater.warm_up(made_up)
 
     return {"act": act, "reanalyze": reanalyze, "evaluate": evaluate, "update": update}

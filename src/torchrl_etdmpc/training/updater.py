@@ -37,15 +37,15 @@ class Updater:
     (``.to()``, ``copy.deepcopy``) need a new updater; :meth:`step` says so.
 
     Args:
-        loss (LatentRolloutLoss): of encoder, dynamics, value heads with targets, and policy, e.g.
-            :class:`~torchrl_etdmpc.objectives.EfficientTDMPCLoss` or :class:`~torchrl_etdmpc.objectives.TDMPC2Loss`; on
-            the device and in the dtype that it will keep.
+        loss (LatentRolloutLoss): e.g. :class:`~torchrl_etdmpc.objectives.EfficientTDMPCLoss`,
+            :class:`~torchrl_etdmpc.objectives.TDMPC2Loss` or one of their parts; on the device and in the dtype that it
+            will keep.
 
     Keyword Args:
         lr (float): learning rate. Default: 3e-4.
         encoder_lr_scale (float): factor of the encoder's learning rate. Default: 0.3.
         grad_clip_norm (float): largest gradient norm of the model and of the policy. Default: 20.
-        tau (float): rate of the target values. Default: 0.01.
+        tau (float): rate of the target values, and of what other targets the loss's terms read. Default: 0.01.
         lr_halved_after (float, optional): updates after which the learning rates are half, after twice as many a third
             and so on: ``lr / (1 + updates / lr_halved_after)``. Not in the thesis. Default: ``None``, constant rates.
         average_decay (float): of averaged weights to plan with, per update; below 1. Not in the thesis. Default: 0,
@@ -102,13 +102,15 @@ class Updater:
             raise ValueError("the loss has no parameter to train; all of them are frozen.")
         self._flat = {part: nn.Parameter(_moved_together(tensors)) for part, tensors in self.parts.items()}
         self._clipped = {name: [p for p in parts if p in self.parts] for name, parts in _CLIPPED_TOGETHER.items()}
-        values = [name for name, value in loss.value_params.flatten_keys(".").items() if value.requires_grad]
-        self._flat_targets: Tensor | None = None
-        if values:
+        followed = loss.target_parameters()
+        if any(followed.values()):
             # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
             SoftUpdate(loss, tau=min(tau, 0.5))
-            targets = dict(loss.target_value_params.flatten_keys(".").items())
-            self._flat_targets = _moved_together([targets[name] for name in values])
+        values = {id(value): target for target, value in followed.pop("value", [])}
+        self._flat_targets: Tensor | None = None
+        if values:
+            self._flat_targets = _moved_together([values[id(value)] for value in self.parts["values"]])
+        self._other_targets = [(target.data, leader.data) for pairs in followed.values() for target, leader in pairs]
         self._views = [p for tensors in self.parts.values() for p in tensors]
         self._addresses = [p.data_ptr() for p in self._views]
         device = self._views[0].device
@@ -136,13 +138,14 @@ class Updater:
         """Gradient steps so far, skipped ones included."""
         return int(self.loss.world_model.version)
 
-    def step(self, batch: TensorDictBase, *, distill: bool = True) -> TensorDictBase:
+    def step(self, batch: TensorDictBase, *, distill: bool | None = None) -> TensorDictBase:
         """One update.
 
         Args:
             batch (TensorDictBase): slices, batch size [B, T]; if they have priority weights, their new priorities are
                 written into it, as the loss does.
-            distill (bool): whether to train the policy (pretraining does not).
+            distill (bool, optional): whether to train the policy, from now on (pretraining does not). Default: as the
+                loss is set, ``loss.distill``.
 
         Returns:
             TensorDictBase: losses, metrics and gradient norms, detached scalars on the device.
@@ -152,10 +155,10 @@ class Updater:
         """
         if [p.data_ptr() for p in self._views] != self._addresses:
             raise RuntimeError("the loss's parameters have been moved; make a new Updater for this loss.")
-        if self.loss.distill != distill:
+        if distill is not None and self.loss.distill != distill:
             self.loss.distill = distill
         inputs = self.loss.slices(batch), self.loss.targets()
-        if self._compiled is None or not distill:
+        if self._compiled is None or not self.loss.distill:
             metrics, gradients, skip = self._gradients(*inputs)
         else:
             with tracing_gradients():
@@ -175,11 +178,18 @@ class Updater:
             skipped = torch.stack(list(skip.values())).amax().long()
             self.skipped += skipped
             self.skipped_in_a_row.add_(1).mul_(skipped)
-        if self._flat_targets is not None:
-            self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
+        self._follow()
         self.loss.world_model.version += 1
         self._average()
         return TensorDict(metrics, batch_size=[]).clone()
+
+    def _follow(self) -> None:
+        """Moves the targets, of which most losses have those of the values alone."""
+        if self._flat_targets is not None:
+            self._flat_targets.lerp_(self._flat["values"].detach(), self.tau)
+        if self._other_targets:
+            targets, leaders = zip(*self._other_targets, strict=True)
+            torch._foreach_lerp_(targets, leaders, self.tau)  # pyright: ignore
 
     @torch.no_grad()
     def _average(self) -> None:
