@@ -17,6 +17,7 @@ from torchrl_etdmpc.analysis import (  # noqa: E402
     evaluated_methods,
     get_benchmark,
     merge_estimates,
+    seed_estimates,
 )
 
 EASY = get_benchmark("dmc-easy")  # budget 200,000
@@ -162,6 +163,25 @@ def test_seeds_with_other_checkpoints_than_each_other_have_their_own_areas():
     assert cell(comparison.areas, "odd", "walker-run")["auc"] == pytest.approx(0.2)
     assert cell(comparison.finals, "odd", "walker-run")["mean"] == pytest.approx(400)
     assert cell(comparison.finals, "odd", "walker-run")["seeds"] == 3
+
+
+def test_after_a_seed_has_ended_values_are_those_of_the_others_alone():
+    ends = {1: 105_000, 2: 105_000, 3: 45_000}
+    rows = [
+        ("ours", "walker-walk", seed, step, 900.0 if seed < 3 else 0.0)
+        for seed, end in ends.items()
+        for step in range(15_000, end + 1, 15_000)
+    ]
+    runs = pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])
+    options = {"benchmark": get_benchmark("dmc-easy"), "tasks": ("walker-walk",)}
+    # At 50,000 nobody was evaluated; a line from 45,000 to 60,000 would mix the means of three seeds and of two.
+    found = compare(runs, seed_estimates(runs.head(0)), budget=50_000, grid_step=5_000, **options)
+    final = found.finals[found.finals["task"] == "walker-walk"].iloc[0]
+    assert (final["mean"], final["standard_error"], final["seeds"]) == (900, 0, 2)
+    returns = found.returns[found.returns["task"] == "walker-walk"].set_index("env_steps")
+    assert returns.loc[[20_000, 50_000], "mean"].tolist() == [600, 900]
+    assert returns.loc[[20_000, 50_000], "seeds"].tolist() == [3, 2]
+    assert set(returns["kind"]) == {"interpolated"}
 
 
 def test_the_grid_starts_where_all_methods_have_begun():

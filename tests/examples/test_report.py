@@ -352,6 +352,7 @@ def test_a_run_without_configuration_and_summary_is_refused(refused):
         "task: walker-walk\n",
         "task: walker-walk\npreset: cpu\nseed:\n",
         "task: [walker-walk]\npreset: cpu\nseed: 1\n",
+        "task: walker-walk\npreset: cpu\nseed: 1\na: &a {x: 1}\nb: {y: *a, z: *a}\n",
     ],
 )
 def test_a_broken_configuration_is_refused(refused, text):
@@ -552,6 +553,23 @@ def test_variants_of_an_experiment_are_compared_in_pairs_at_its_budget(run_main,
     assert [float(row["difference"]) for row in read_rows("paired.csv")][:2] == [-10, -10]
 
 
+def test_runs_below_somebody_else_s_experiment_are_no_variants_of_it(run_main, capfd):
+    Path("experiment.yaml").write_text("{variants: {small: {}}, tasks: [walker-walk], seeds: [1], budget: 100000}")
+    make_run("runs/walker-walk/cpu/seed1")
+    make_run("runs/walker-walk/tdmpc2-cpu/seed2", preset="tdmpc2-cpu", seed=2)
+    run_main("runs")
+    out, err = capfd.readouterr()
+    assert (err, "missing" in out) == ("", False)
+    assert {"cpu", "tdmpc2-cpu"} < set(read_table(Path("report", "final.csv"))["walker-walk"])
+
+
+def test_a_variant_has_its_name_from_within_its_folder_too(run_main, monkeypatch):
+    root = make_experiment()
+    monkeypatch.chdir(root / "b")
+    run_main(".")
+    assert "b" in read_table(Path("report", "final.csv"))["walker-walk"]
+
+
 def test_a_base_that_is_no_name_of_runs_is_refused(refused):
     make_experiment()
     assert refused("runs", "--paired", "c") == "--paired=c is no name of runs; choose one of a, b."
@@ -635,6 +653,17 @@ def test_a_thousand_runs_have_a_report_in_less_than_a_minute():
     assert float(seconds) < 60
 
 
+def test_runs_that_spell_out_what_the_task_has_anyway_are_not_changed_ones(run_main):
+    make_run("runs/a")
+    make_run("runs/b", seed=2)
+    with open("runs/b/config.yaml", "a") as file:
+        file.write("episode_length: 1000\naction_repeat: 2\n")
+    run_main("runs", "--out", "out")
+    page = Path("out", "index.md").read_text()
+    assert "not as the benchmark has it" not in page
+    assert "BMPC |" in page
+
+
 def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
     make_run("runs/a")
     with open("runs/a/config.yaml", "a") as file:
@@ -649,14 +678,14 @@ def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
 
 @pytest.mark.parametrize("order", [("a", "b"), ("b", "a")])
 def test_every_run_s_changes_of_a_task_count(run_main, order):
-    for name, setting in {"a": "episode_length: 100\n", "b": "action_repeat: 2\n"}.items():
+    for name, setting in {"a": "episode_length: 100\n", "b": "episode_length: 500\n"}.items():
         make_run(f"runs/{name}")
         with open(f"runs/{name}/config.yaml", "a") as file:
             file.write(setting)
     make_run("runs/own")
     run_main(*(f"{name}=runs/{name}" for name in order), "own=runs/own", "--out", "out")
     page = Path("out", "index.md").read_text()
-    told = {"a": "episode_length=100 by a", "b": "action_repeat=2 by b"}
+    told = {"a": "episode_length=100 by a", "b": "episode_length=500 by b"}
     assert f"- walker-walk was run with {'; '.join(told[name] for name in order)}, not as the benchmark has it." in page
     assert "- Nothing published stands beside walker-walk: returns of other episodes do not compare.\n" in page
     assert "BMPC |" not in page
@@ -707,6 +736,26 @@ def test_a_bar_in_a_name_makes_no_column(run_main):
     for table in Path("out", "index.md").read_text().split("\n\n"):
         lines = [line for line in table.splitlines() if line.startswith("|")]
         assert len({line.replace("\\|", "").count("|") for line in lines}) <= 1, table
+
+
+def test_names_may_hold_what_is_mathematics_elsewhere(run_main):
+    make_run("runs/a")
+    make_run("runs/b", seed=2)
+    run_main("a $_$ b=runs/a", "$5 and $6=runs/b", "--out", "out")
+    assert Path("out", "curves.png").exists()
+
+
+@pytest.mark.parametrize("name", ["best", "second_best"])
+def test_runs_are_not_called_like_a_column_of_the_tables(refused, name):
+    make_run("runs/a")
+    assert refused(f"{name}=runs/a") == f"{name} is a column of the tables; give the runs another name (NAME=PATH)."
+
+
+def test_a_step_of_the_grid_that_was_given_is_taken(run_main):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 10},0.5,10\n" for steps in range(0, 7_008, 1_002))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs", "--budget", "7014", "--grid-step", "1002", "--out", "out")
+    assert "every 1,002 env steps" in Path("out", "index.md").read_text()
 
 
 def test_a_budget_without_a_grid_is_refused(refused):

@@ -404,6 +404,11 @@ REFUSED_AT_ONCE = [
         "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise the budget or lower "
         "replay.seed_decisions.",
     ),
+    (  # 21 decisions of two environments are 22
+        {"total_env_steps": 44, "num_envs": 2, "replay__seed_decisions": 21},
+        "total_env_steps must exceed the random phase of 44 env steps, got 44; raise the budget or lower "
+        "replay.seed_decisions.",
+    ),
     *(
         ({name: 0}, f"{name} must be at least 1, got 0.")
         for name in (

@@ -31,8 +31,8 @@ from torchrl_etdmpc.training import (  # noqa: E402
     build_agent,
     build_replay,
     launch,
+    load_agent,
     preset,
-    read_agent_file,
     read_run_config,
 )
 from torchrl_etdmpc.training.ray_cluster import RayCluster  # noqa: E402
@@ -305,14 +305,22 @@ def test_settings_that_workers_cannot_follow_are_refused(changes, message):
     assert str(caught.value).startswith(message)
 
 
-def test_agent_files_know_nothing_of_workers(started, tmp_path):
+def test_an_agent_file_is_loaded_by_one_process_and_its_run_gone_on_with_by_workers(started, tmp_path):
     started()
     line = launch(config_of(run_dir=str(tmp_path / "run"), total_env_steps=60, log_every=10))
     directory = RunDirectory(tmp_path / "run")
     assert line.startswith("gym/Pendulum-v1: return ") and directory.finished
-    stored = read_agent_file(directory.last_agent)["config"]
-    assert TrainConfig.from_dict(stored).task == "gym/Pendulum-v1"
-    assert read_run_config(directory, DistributedConfig).workers == 2
+    agent, loaded, _ = load_agent(directory.last_agent)
+    assert type(loaded) is TrainConfig and loaded.task == "gym/Pendulum-v1"
+    stored = read_run_config(directory, DistributedConfig)
+    assert (stored.workers, stored.rows_per_batch) == (2, config_of().rows_per_batch)
+    text = directory.config.read_text()
+    directory.config.write_text(text[:-20])
+    with pytest.warns(UserWarning, match="the settings are those of"):
+        assert read_run_config(directory, DistributedConfig) == stored
+    with pytest.warns(UserWarning, match="the settings are those of"), pytest.raises(ValueError, match="is a run of w"):
+        read_run_config(directory)
+    directory.config.write_text(text)
     assert CheckpointStore(directory.checkpoints).exists()
     with directory.train.open() as file:
         rows = list(csv.DictReader(file))

@@ -21,6 +21,7 @@ from torchrl.checkpoint import GlobalRNGState
 pytest.importorskip("dm_control")
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore  # noqa: E402
+from torchrl_etdmpc.collectors import StepCollector  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     RunInterrupted,
@@ -191,7 +192,8 @@ def test_a_simulator_that_cannot_be_restored_does_not_begin_as_the_run_did(
     for _ in range(4):
         run.learner.collector.step()
     run.checkpoints.save()
-    starts = []
+    starts, seeds, set_seed = [], [], StepCollector.set_seed
+    monkeypatch.setattr(StepCollector, "set_seed", lambda self, seed: seeds.append(seed) or set_seed(self, seed))
     for _ in range(2):
         run.log.directory.close()
         with pytest.warns(UserWarning, match="the environment cannot be restored, so fresh episodes begin"):
@@ -201,6 +203,7 @@ def test_a_simulator_that_cannot_be_restored_does_not_begin_as_the_run_did(
         starts.append(run.learner.collector.step()["observation"])
         run.checkpoints.save()
     assert len({tuple(start.reshape(-1).tolist()) for start in (begun, *starts)}) == 3
+    assert min(seeds) > run.config.seed + 10_000  # the evaluations' seed, which a long run must not come to
 
 
 def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path, small_config, make_run):

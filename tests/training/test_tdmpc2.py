@@ -48,6 +48,12 @@ def small_config(tiny_config):
     return make
 
 
+def test_plans_that_no_term_reads_are_not_made_anew(small_config):
+    message = r"^reanalyze\.every must be 0 where no term of the loss reads a plan, got 10\.$"
+    with pytest.raises(ValueError, match=message):
+        build_agent(small_config(reanalyze={"every": 10}), 5, 1)
+
+
 def outcome(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
     """Everything that must not depend on interruptions."""
     rows = {}

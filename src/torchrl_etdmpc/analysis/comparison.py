@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,7 @@ class Comparison:
         budget (int): env steps.
         grid (ndarray): env steps of the shared evaluation grid.
         seed_curves (DataFrame): of the methods that are known per seed.
-        estimates (DataFrame): of all methods, one row per evaluation.
+        estimates (DataFrame): of all methods, one row per evaluation, and more where seeds differ in their steps.
         constants (Series): by which tasks are normalised.
         areas (DataFrame): ``method, task, auc, standard_error, seeds``, normalised, with the aggregate as the last
             task.
@@ -97,14 +97,16 @@ def merge_estimates(seed_curves: pd.DataFrame, means: pd.DataFrame) -> pd.DataFr
     return pd.concat([part for part in (table, rest) if len(part)] or [table], ignore_index=True)
 
 
-def on_common_steps(seed_curves: pd.DataFrame) -> pd.DataFrame:
+def on_common_steps(seed_curves: pd.DataFrame, further: Iterable[float] = ()) -> pd.DataFrame:
     """Every seed's curve at all steps of its method on the task that lie within its own evaluations.
 
     Between two evaluations a return lies on the straight line. Where seeds were evaluated at other steps than each
-    other, a mean would otherwise be of whoever happened to be evaluated there.
+    other, a mean would otherwise be of whoever happened to be evaluated there; and between the end of one of them and
+    the next evaluation of the others, a line would lead from the mean of all to that of those who are left.
 
     Args:
         seed_curves (DataFrame): ``method, task, seed, env_steps, return_mean``; NaN returns are left out.
+        further (iterable of float): more steps at which curves are read, for methods whose seeds differ in their steps.
 
     >>> rows = [("a", "t", 1, 10, 0.0), ("a", "t", 1, 30, 2.0), ("a", "t", 2, 20, 5.0)]
     >>> curves = pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])
@@ -115,7 +117,7 @@ def on_common_steps(seed_curves: pd.DataFrame) -> pd.DataFrame:
     for _, curves in seed_curves.dropna(subset="return_mean").groupby(["method", "task"], sort=False):
         steps = np.unique(curves["env_steps"])
         if len(curves) < len(steps) * curves["seed"].nunique():
-            lines = interpolate(seed_estimates(curves), steps).dropna(subset="mean")
+            lines = interpolate(seed_estimates(curves), np.union1d(steps, [*further])).dropna(subset="mean")
             curves = lines.rename(columns={"mean": "return_mean"})[[*SEED_COLUMNS]]
         parts.append(curves)
     return pd.concat(parts, ignore_index=True) if parts else seed_curves
@@ -169,7 +171,9 @@ def compare(
     """
     tasks = tuple(tasks or benchmark.tasks)
     budget = budget or benchmark.budget
-    estimates = merge_estimates(seed_curves if from_zero else on_common_steps(seed_curves), means)
+    read_at = {*seed_curves["env_steps"], *means["env_steps"], *steps, *range(0, budget, grid_step), budget}
+    read_at.add(benchmark.budget)
+    estimates = merge_estimates(seed_curves if from_zero else on_common_steps(seed_curves, read_at), means)
     evaluated = evaluated_cells(estimates, merge_estimates(seed_curves, means))
     points = no_points() if points is None else points
     points = points[points["task"].isin(tasks) & (points["env_steps"] <= budget)].reset_index(drop=True)

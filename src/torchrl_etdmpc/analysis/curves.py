@@ -22,8 +22,10 @@ import pandas as pd
 import yaml
 
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
+from torchrl_etdmpc.envs import get_task
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.dotted import flat
+from torchrl_etdmpc.runs.files import load_yaml
 
 SEED_COLUMNS = ("method", "task", "seed", "env_steps", "return_mean")
 POINT_COLUMNS = ("method", "task", "env_steps", "mean", "source")
@@ -117,6 +119,9 @@ class Run:
         directory, (file, values) = RunDirectory(run_dir), _read_values(run_dir)
         header, table = _header(file, values), read_evaluations(run_dir)
         told = {name: header[name] for name in CHANGED if header[name] is not None}
+        if header["task"] in _ACTION_REPEAT:  # what a task has anyway is no change
+            own = get_task(header["task"])
+            told = {name: value for name, value in told.items() if value != getattr(own, name)}
         _check_units(table.assign(task=header["task"]), directory.eval, told.get("action_repeat"))
         names = {"method": method or header["preset"], "task": header["task"], "seed": header["seed"]}
         columns = {name: table[name].astype(float) for name in ("env_steps", "return_mean")}
@@ -184,8 +189,7 @@ def _read_values(run_dir: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]
         )
     text = files[0].read_text(encoding="utf-8", errors="replace")
     try:
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is there
-        values = json.loads(text) if files[0] == directory.summary else yaml.load(text, loader)
+        values = json.loads(text) if files[0] == directory.summary else load_yaml(text)
     except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"{files[0]} does not give the run's task, preset and seed.") from error
     return files[0], values if isinstance(values, dict) else {}

@@ -92,13 +92,25 @@ def read_experiment(root: Path) -> Experiment:
 
 
 def experiment_root(run: Path) -> Path | None:
-    """The folder above a run that holds an ``experiment.yaml``, if there is one (a task's name may have a slash).
+    """The folder of the experiment that a run belongs to, ``None`` if to none.
+
+    That is the nearest folder above it, up to five, with an ``experiment.yaml`` that lists the variant by which the
+    run's folder begins; where that file cannot be read, nobody knows better.
 
     >>> from pathlib import Path
     >>> experiment_root(Path("runs/alone")) is None
     True
     """
-    return next((folder for folder in list(run.parents)[:5] if (folder / EXPERIMENT).is_file()), None)
+    whole = run.absolute()
+    for folder in list(whole.parents)[:5]:
+        if (folder / EXPERIMENT).is_file():
+            try:
+                known = whole.relative_to(folder).parts[0] in read_experiment(folder).variants
+            except ValueError:
+                known = True
+            if known:  # as it was spelled, if it was
+                return next((given for given in run.parents if given.absolute() == folder), folder)
+    return None
 
 
 def incomplete_runs(runs: Sequence[Run], experiments: Iterable[Experiment] = ()) -> list[str]:
@@ -138,7 +150,7 @@ def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[
     for run in runs:
         longest[run.task] = max(longest.get(run.task, 0.0), run.last)  # a NaN is never the larger one
     for run in runs:
-        plan = next((plan for plan in experiments if plan.root in run.path.parents), None)
+        plan = next((plan for plan in experiments if plan.root.absolute() in run.path.absolute().parents), None)
         budget = plan.env_steps(run.task, run.method) if plan else None
         target = budget or longest[run.task]
         where = f"{run.method} on {run.task} with seed {run.seed}"

@@ -69,7 +69,8 @@ def write_report(
     """
     out = Path(out)
     files = _tables(comparison)
-    figures = _figures(comparison)
+    with matplotlib.rc_context({"text.parse_math": False}):  # a name may hold any sign
+        figures = _figures(comparison)
     files["index.md"] = _page(comparison, files, incomplete)
     contents = {name: text.encode() for name, text in files.items()}
     for name, figure in figures.items():

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+RANKS = ("best", "second_best")
+"""Columns beside those of methods, so no names for methods."""
 AGGREGATE = "Normalized aggregate"
 """The name of the row over all tasks in tables of normalised numbers."""
 
@@ -48,7 +50,7 @@ def rank_methods(table: pd.DataFrame) -> pd.DataFrame:
     for _, row in table.iterrows():
         order = list(row.dropna().sort_values(ascending=False, kind="stable").index)
         rows.append((order + [None, None])[:2])
-    return pd.DataFrame(rows, index=table.index, columns=["best", "second_best"])
+    return pd.DataFrame(rows, index=table.index, columns=list(RANKS))
 
 
 def to_csv(table: pd.DataFrame, seeds: pd.DataFrame, errors: pd.DataFrame) -> str:

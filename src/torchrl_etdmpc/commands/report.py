@@ -123,11 +123,13 @@ def read(arguments: argparse.Namespace) -> tuple[list[Run], Table, list[Experime
             if (name, folder.resolve()) in known:  # below two of the arguments
                 continue
             known.add((name, folder.resolve()))
-            root = None if name else experiment_root(folder)
-            if root is not None and (root == Path(path) or Path(path) in root.parents):
-                roots[root] = None
+            root, method = None if name else experiment_root(folder), name
+            if root is not None:
+                method = folder.absolute().relative_to(root.absolute()).parts[0]
+                if Path(path).absolute() in (root.absolute(), *root.absolute().parents):
+                    roots[root] = None
             try:
-                runs.append(Run.read(folder, method=name or (root and folder.relative_to(root).parts[0])))
+                runs.append(Run.read(folder, method=method))
             except (ValueError, OSError) as error:
                 broken[folder] = error
     if not runs:
@@ -167,6 +169,8 @@ def choose_budget(
         (budget,) = planned
     else:
         budget = min(reached, benchmark.budget)
+    if arguments.grid_step:
+        return budget, arguments.grid_step
     if step is None:
         first = begins(runs).max()
         steps = [budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0]
@@ -177,7 +181,7 @@ def choose_budget(
             raise ValueError("the runs end at 1 env step, which makes no curve; wait for an evaluation after it.")
         if step is None:
             budget, step = budget - 1, (budget - 1) // 2
-    return budget, arguments.grid_step or step
+    return budget, step
 
 
 def choose_benchmark(arguments: argparse.Namespace, runs: Table) -> Benchmark:
@@ -314,7 +318,12 @@ def missing(lines: list[str], shown: int = 5) -> str:
 
 
 def refuse_clash(methods: list[str], tables: list[Table]) -> None:
-    """Raises ValueError if runs have the name of a baseline."""
+    """Raises ValueError if runs have the name of a baseline, or of a column that every table has."""
+    from torchrl_etdmpc.analysis.tables import RANKS
+
+    for name in RANKS:
+        if name in methods:
+            raise ValueError(f"{name} is a column of the tables; give the runs another name (NAME=PATH).")
     clash = sorted({name for table in tables for name in table["method"]} & set(methods))
     if clash:
         raise ValueError(f"{clash[0]} names both runs and a baseline; give the runs another name (NAME=PATH).")

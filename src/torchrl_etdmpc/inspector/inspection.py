@@ -94,7 +94,7 @@ class Inspection:
         task (Task, optional): that it acts in. Default: none, then there are states of the replay buffer alone.
 
     Keyword Args:
-        play (callable, optional): nothing to the policy that plays the episodes. Default: the planner.
+        bare (bool): whether the agent's policy plays the episodes, and not the planner. Default: ``False``.
         steps (int, optional): decisions of an episode, at most. Default: whole episodes.
         replay (callable, optional): a row's number to its observation ``[O]``.
         rows (int): of the replay buffer. Default: 0.

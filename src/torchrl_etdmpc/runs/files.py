@@ -223,3 +223,21 @@ def remove_partial_files(folder: Path) -> None:
     for file in folder.glob(".*.partial*"):
         if file.is_file():
             file.unlink(missing_ok=True)
+
+
+def load_yaml(text: str) -> Any:
+    """What a file of settings says: numbers, texts, lists and mappings.
+
+    Raises:
+        yaml.YAMLError: if it is not YAML.
+        ValueError: if it refers to itself: few bytes can mean gigabytes.
+
+    >>> load_yaml("{seed: 1, optim: {lr: 0.001}}")
+    {'seed': 1, 'optim': {'lr': 0.001}}
+    """
+    import yaml
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is there
+    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, loader)):
+        raise ValueError("it refers to itself")
+    return yaml.load(text, loader)

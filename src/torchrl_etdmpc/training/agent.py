@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from torchrl_etdmpc.functional import discount_from_episode_length
+from torchrl_etdmpc.keys import PLAN
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives import EfficientTDMPCLoss, LatentRolloutLoss, TDMPC2Loss
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
@@ -194,6 +195,10 @@ def build_agent(
     world_model = build_world_model(config.model, observation_dim, action_dim, terminates=task.terminates).to(device)
     ignore = config.model.termination is False
     loss = build_loss(world_model, config.loss, discount=discount, ignore_termination=ignore)
+    if config.reanalyze.every and not any(key[0] == PLAN for key in loss.in_keys):
+        raise ValueError(
+            f"reanalyze.every must be 0 where no term of the loss reads a plan, got {config.reanalyze.every}."
+        )
     with named_settings("optim", config.optim):
         optim = arguments(config.optim, "batch_size", "updates_per_decision")
         updater = Updater(loss, tau=config.loss.tau, compile_mode=compile_mode, **optim)

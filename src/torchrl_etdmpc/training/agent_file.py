@@ -23,8 +23,12 @@ from torchrl_etdmpc.runs.files import (
 )
 from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
+from torchrl_etdmpc.training.distributed import DistributedConfig
 
 FORMAT = 2
+_OF_WORKERS = {field.name for field in dataclasses.fields(DistributedConfig)} - {
+    field.name for field in dataclasses.fields(TrainConfig)
+}
 _ENTRIES = {
     "config": dict,
     "observation_dim": int,
@@ -64,7 +68,7 @@ class AgentFile:
             settings |= {name: getattr(self.config.task_spec, name) for name in TASK_SETTINGS}
         return {
             "format": FORMAT,
-            "config": {field.name: settings[field.name] for field in dataclasses.fields(TrainConfig)},  # not of workers
+            "config": settings,
             "observation_dim": self.agent.world_model.observation_dim,
             "action_dim": self.agent.world_model.action_dim,
             "counters": dict(self.counters()),
@@ -200,7 +204,7 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
 
 
 def config_of(path: str | Path, values: Mapping[str, Any]) -> TrainConfig:
-    """The run that an agent file is of, from what it stores.
+    """The run that an agent file is of, from what it stores; who trained it, workers or not, is left out.
 
     Raises:
         CheckpointError: if this version, or this process, knows no such run.
@@ -210,7 +214,7 @@ def config_of(path: str | Path, values: Mapping[str, Any]) -> TrainConfig:
     'cpu'
     """
     try:
-        return TrainConfig.from_dict(values)
+        return TrainConfig.from_dict({name: value for name, value in values.items() if name not in _OF_WORKERS})
     except (ValueError, TypeError) as error:
         raise CheckpointError(
             f"{path} holds an agent that cannot be rebuilt: {' '.join(str(error).split())}"

@@ -303,7 +303,8 @@ class TrainConfig:
             self.replay.capacity >= least,
             f"replay.capacity must be at least {least} with these settings, got {self.replay.capacity}.",
         )
-        seed_env_steps = self.seed_decisions * task.action_repeat
+        together = max(self.decisions_per_step, 1)
+        seed_env_steps = -(-self.seed_decisions // together) * together * task.action_repeat
         _require(
             self.total_env_steps > seed_env_steps,
             f"total_env_steps must exceed the random phase of {seed_env_steps} env steps, got {self.total_env_steps}; "

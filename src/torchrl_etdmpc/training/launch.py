@@ -229,13 +229,10 @@ def read_run_config(directory: RunDirectory, kind: type[TrainConfig] = TrainConf
         why = f"{directory.config} is missing" if lost else str(error).rstrip(".")
         # Commands read it more than once; from one place the warning is shown once.
         warnings.warn(f"{why}; the settings are those of {directory.last_agent}.", stacklevel=1)
-    else:
-        by_workers = is_distributed(values)
-        if isinstance(values, Mapping) and by_workers != issubclass(kind, DistributedConfig):
-            who, command = ("workers", "distributed") if by_workers else ("one process", "train")
-            raise ValueError(
-                f"{directory} is a run of {who}; go on with the command {command}, or start a new run_dir."
-            )
+    by_workers = is_distributed(values)
+    if isinstance(values, Mapping) and by_workers != issubclass(kind, DistributedConfig):
+        who, command = ("workers", "distributed") if by_workers else ("one process", "train")
+        raise ValueError(f"{directory} is a run of {who}; go on with the command {command}, or start a new run_dir.")
     try:
         return kind.from_dict(values)
     except (ValueError, TypeError) as error:

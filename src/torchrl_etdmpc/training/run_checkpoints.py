@@ -145,9 +145,12 @@ class RunCheckpoints:
         return folder
 
     def _begin_elsewhere(self) -> None:
-        """Gives the environment another seed: with the run's own it would begin as the run did, at every resume."""
+        """Gives the environment another seed: with the run's own it would begin as the run did, at every resume.
+
+        Not that of the evaluations either, which is 10,000 after the run's.
+        """
         collector = self.learner.collector
-        collector.set_seed((self.config.seed + collector.frames) % 2**32)
+        collector.set_seed((self.config.seed + 20_000 + collector.frames) % 2**32)
 
 
 def _is_whole(path: Path) -> bool:
