@@ -2,8 +2,8 @@
 First run and its curves
 ========================
 
-A run is a configuration and a folder. This page trains Gymnasium's Pendulum for 1,200 steps, a minute of its time,
-and reads what the run wrote.
+A run is a configuration and a folder. This page trains Gymnasium's Pendulum for 1,200 steps, which is a minute of
+simulated time, and reads what the run wrote.
 """
 
 # %%

@@ -10,7 +10,7 @@ have changed since. Reanalyze makes some of them anew. This page measures what g
 # The experiment
 # --------------
 # A small agent acts on Pendulum for 360 decisions, with one update each after the first sixty. Three times: without
-# reanalyze, with a quarter of one batch in 20 made anew, and of one in 5.
+# reanalyze, with a quarter of every 20th batch made anew, and of every 5th.
 
 import matplotlib.pyplot as plt
 import torch
@@ -64,10 +64,10 @@ def experiment(interval, insertion="step"):
             continue
         updater.step(buffer.sample())
         if frame % 20 == 0:
-            rows = buffer[:]
+            rows = buffer.storage[:]
             steps.append(frame - 60)
             ages.append((world_model.version - rows["plan", "version"]).float().mean().item())
-    return buffer[:], world_model, fresh, (steps, ages), waiting
+    return buffer.storage[:], world_model, fresh, (steps, ages), waiting
 
 
 results = {interval: experiment(interval) for interval in (0, 20, 5)}

@@ -164,7 +164,7 @@ def test_a_missing_package_is_named_with_its_command(checkpoint, run_main, monke
 
     monkeypatch.setattr(builtins, "__import__", without)
     message, _, _ = run_main(f"checkpoint={checkpoint}")
-    assert message == "error: the page needs dash and plotly; run: pip install 'torchrl-etdmpc[inspect]'"
+    assert message == "error: the page needs dash and plotly; in the checkout: pip install -e '.[inspect]'"
 
 
 @pytest.mark.parametrize(

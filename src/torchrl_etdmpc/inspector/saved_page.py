@@ -102,7 +102,7 @@ def plotly_script() -> str:
     try:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
-        raise ImportError("the page needs dash and plotly; run: pip install 'torchrl-etdmpc[inspect]'") from error
+        raise ImportError("the page needs dash and plotly; in the checkout: pip install -e '.[inspect]'") from error
     return get_plotlyjs()
 
 

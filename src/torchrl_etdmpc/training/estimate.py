@@ -74,7 +74,7 @@ def what_it_takes(config: TrainConfig, device: torch.device, env_steps: int = 0,
     line = f"about {_duration(seconds)} on this CPU{first}"
     small = "tdmpc2-cpu" if config.model.action_values else "cpu"
     if config.preset not in ("cpu", "tdmpc2-cpu") and seconds > 3600:
-        line += f"; preset={config.preset} is made for a GPU and there is none here: preset={small} learns in minutes"
+        line += f"; preset={config.preset} is made for a GPU and there is none here: preset={small} is made for a CPU"
     return line
 
 

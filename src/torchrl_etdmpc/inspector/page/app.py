@@ -43,7 +43,7 @@ def make_page(
     try:
         import dash
     except ImportError as error:
-        raise ImportError("the page needs dash and plotly; run: pip install 'torchrl-etdmpc[inspect]'") from error
+        raise ImportError("the page needs dash and plotly; in the checkout: pip install -e '.[inspect]'") from error
     app = dash.Dash(
         "torchrl_etdmpc",
         title="Planner inspector",
