@@ -228,7 +228,8 @@ def test_the_means_of_the_readme_are_those_of_the_table():
         column = steps.removesuffix(" env steps"), tasks.split()[1]
         assert returns == [table[names.get(method, method)][column] for method in head[2:]], column
     figure = table["TD-MPC2 (EZ-V2's figure)"]["50,000", "tuned"]
-    assert f"On the six tuned tasks TD-MPC2 has {figure} at 50,000 env steps, read off a figure" in " ".join(page.split())
+    told = f"On the six tuned tasks TD-MPC2 has {figure} at 50,000 env steps, read off a figure"
+    assert told in " ".join(page.split())
 
 
 def test_the_means_with_former_settings_are_those_that_are_committed():

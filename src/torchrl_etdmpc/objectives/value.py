@@ -173,7 +173,7 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
     Keyword Args:
         discount (float): gamma, in (0, 1].
         value_coef (float): weight of the term. Default: 0.1.
-        value_beta (float): pessimism of the targets, the weight of the ensemble's standard deviation, not negative.
+        value_beta (float): pessimism of the targets, the weight of the standard deviation of the heads' mean, >= 0.
             Default: 0, the mean.
         value_replayed (float): weight of :func:`replayed_value_target` beside :func:`imagined_value_target`, in
             [0, 1]. Default: 0.

@@ -92,7 +92,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         large_action_dim (int): Default: 20.
         score (str or callable): ``"final"``, ``"mean"``, ``"adaptive"`` or a callable from the return table
             ``[..., D, F, V]`` to ``[...]``, see :class:`~torchrl_etdmpc.planners.Score`. Default: ``"mean"``.
-        beta (float): penalty on the ensemble's standard deviation, for a named score. Default: 0.
+        beta (float): penalty on the standard deviation of the heads' mean, for a named score. Default: 0.
         discount (float): gamma, in (0, 1]. Default: 0.99.
         inverse_temperature (float): of the elites' weights (the lineage calls it "temperature"). Default: 0.5.
         std_min (float): Default: 0.05.

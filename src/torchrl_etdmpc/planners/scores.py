@@ -71,7 +71,7 @@ class FinalScore:
     """Return estimate of the last depth: ``mean_ij Q_H - beta sigma_H`` (BMPC; thesis Eq. 3.2 and 3.4.3).
 
     Args:
-        beta (float): weight of the ensemble's standard deviation. Default: 0.
+        beta (float): weight of the standard deviation of the heads' mean. Default: 0.
 
     >>> import torch
     >>> FinalScore()(torch.tensor([[[1.0, 3.0]], [[5.0, 7.0]]])).item()
@@ -93,7 +93,7 @@ class MeanScore:
     """Return estimates averaged over depths, then ``mean_ij Qbar - beta sigma(Qbar)`` (thesis Eq. 3.4).
 
     Args:
-        beta (float): weight of the ensemble's standard deviation. Default: 0.
+        beta (float): weight of the standard deviation of the heads' mean. Default: 0.
 
     >>> import torch
     >>> MeanScore()(torch.tensor([[[1.0, 3.0]], [[5.0, 7.0]]])).item()

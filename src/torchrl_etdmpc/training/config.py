@@ -121,8 +121,8 @@ class LossConfig:
     value_coef: float = 0.1
     """Weight of the values' error."""
     value_beta: float = 0.0
-    """Pessimism of the value targets: the weight of the standard deviation over dynamics and value heads. Not of action
-    values, whose targets are the least of two heads."""
+    """Pessimism of the value targets: the weight of the standard deviation of the mean over dynamics and value heads.
+    Not of action values, whose targets are the least of two heads."""
     value_replayed: float = 0.0
     """How much of the value targets, from 0 to 1, is what was paid in the rest of the replayed slice, and not what the
     model imagines of the next step. Not in the thesis, and not of action values, which learn from replayed steps
