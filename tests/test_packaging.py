@@ -178,6 +178,7 @@ def test_whole_files_are_made_in_one_place():
         "runs/files.py": {"os.fsync", "os.link", "os.replace", "tempfile"},  # an unnamed one, to see whether one can
         "checkpoints/store.py": {"os.replace"},  # of folders
         "training/ray_cluster.py": {"tempfile"},  # a folder for Ray's sockets, which goes with them
+        "commands/command_line.py": {"tempfile"},  # a folder for Hydra's notes of a sweep, likewise
     }
 
 

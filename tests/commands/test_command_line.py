@@ -58,8 +58,18 @@ WRONG = [
     (("run_dir=${nope}",), "run_dir cannot be read: Interpolation key 'nope' not found"),
     (
         ("--multirun", "seed=1,2", "run_dir=here"),
-        "run_dir=here would be that of every run; leave it out, or put what differs into it, e.g. "
-        "run_dir='runs/${seed}'.",
+        "run_dir=here would be that of several runs, which differ in seed; put what differs into it, e.g. "
+        "run_dir='here/${seed}'.",
+    ),
+    (
+        ("--multirun", "seed=1,2", "planner.horizon=range(3,5)"),
+        "the default run_dir would be that of several runs, which differ in planner.horizon; put what differs into it, "
+        "e.g. run_dir='runs/${seed}/${planner.horizon}'.",
+    ),
+    (
+        ("-m", "seed=1,2", "planner.horizon=3,4", "task.episode_length=choice(200,400)", "run_dir=runs/${seed}"),
+        "run_dir=runs/${seed} would be that of several runs, which differ in planner.horizon, episode_length; put what "
+        "differs into it, e.g. run_dir='runs/${seed}/${planner.horizon}/${episode_length}'.",
     ),
     (("--help", "planer"), "there is no group and no setting 'planer'; did you mean planner? --help lists all."),
 ]
@@ -97,6 +107,15 @@ def test_a_flag_may_stand_between_settings(run_command, tmp_path, monkeypatch):
     assert run_command("preset=cpu", "--multirun", "seed=3,4").seed == 3
     assert run_command("preset=cpu", "--multirun", "seed=3", "run_dir=one").run_dir == "one"
     assert run_command("preset=cpu", "--multirun", "seed=3,4", "run_dir=runs/${seed}").run_dir == "runs/3"
+
+
+def test_a_sweep_leaves_no_folder_but_those_of_its_runs(run_command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sweep = ("preset=cpu", "--multirun", "planner.horizon=3,4", "run_dir=runs/${planner.horizon}")
+    assert run_command(*sweep).planner.horizon == 3
+    assert list(tmp_path.iterdir()) == []
+    assert run_command(*sweep, "hydra.sweep.dir=kept").planner.horizon == 3
+    assert (tmp_path / "kept" / "multirun.yaml").is_file()
 
 
 def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):

@@ -8,8 +8,10 @@ import functools
 import os
 import re
 import sys
+import tempfile
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from torchrl_etdmpc.commands.settings_help import Setting, groups_of, help_text, settings_of
@@ -115,7 +117,8 @@ def hydra_main(
                     completed = plain if complete is None else complete(plain, explicit_settings())
                     main(config_from_dict(config_class, completed))
 
-            run()
+            with _without_traces_of_a_sweep():
+                run()
 
         return wrapped
 
@@ -153,6 +156,7 @@ def _command() -> str:
 _ELSEWHERE = {"workers": "distributed", "engine": "distributed", "address": "distributed"}
 """Settings that stand in another command alone."""
 _FLAGS = {"--cfg", "-c", "--resolve", "--multirun", "-m"}
+_SWEEP_FLAGS = {"--multirun", "-m"}
 _PATHS = {"run_dir", "checkpoint", "out", "video", "save"}
 
 
@@ -163,7 +167,7 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
         ValueError: naming what was typed, and what may have been meant.
     """
     settings, groups = settings_of(config_class), groups_of(config_class)
-    sweep = bool({"--multirun", "-m"} & set(arguments))
+    sweep = bool(_SWEEP_FLAGS & set(arguments))
     flags, checked, rest = [], [], iter(arguments)
     for argument in rest:
         bare = argument.lstrip("-")
@@ -204,15 +208,40 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
     for name, setting in settings.items():
         if setting.default is dataclasses.MISSING and name not in given and not {"--cfg", "-c"} & set(flags):
             raise ValueError(f"{name}=... is missing: {setting.meaning[0].lower()}{setting.meaning[1:]}")
-    values = dict(argument.split("=", 1) for argument in checked)
-    fixed = "${" not in values.get("run_dir", "${")
-    several = any("," in re.sub(r"\[.*?\]|\(.*?\)", "", value) for name, value in values.items() if name != "run_dir")
-    if sweep and fixed and several:
-        raise ValueError(
-            f"run_dir={values['run_dir']} would be that of every run; leave it out, or put what differs into it, e.g. "
-            "run_dir='runs/${seed}'."
-        )
+    if sweep and "run_dir" in settings:
+        _require_directories(checked)
     return flags + checked  # Hydra takes no flag between settings
+
+
+def _require_directories(arguments: list[str]) -> None:
+    """Each run of a sweep has a directory of its own: without ``run_dir`` it is named by task, preset and seed."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    overrides = OverridesParser.create().parse_overrides(arguments)
+    swept = [it.key_or_group for it in overrides if it.is_sweep_override()]
+    swept = [name for name in swept if name != "run_dir" and not name.startswith("hydra.")]
+    run_dir = dict(argument.split("=", 1) for argument in arguments).get("run_dir", "null")
+    default = run_dir == "null"
+    named = ["task", "preset", "seed"] if default else re.findall(r"\$\{([\w.]+)\}", run_dir)
+    shared = [name for name in swept if name not in named]
+    if shared:
+        parts = ["runs", *swept] if default else [run_dir, *shared]
+        remedy = "/".join([parts[0], *(f"${{{name}}}" for name in parts[1:])])
+        raise ValueError(
+            f"{'the default run_dir' if default else f'run_dir={run_dir}'} would be that of several runs, which differ "
+            f"in {', '.join(shared)}; put what differs into it, e.g. run_dir='{remedy}'."
+        )
+
+
+@contextmanager
+def _without_traces_of_a_sweep() -> Iterator[None]:
+    """Hydra's own files of a sweep are gone when it ends, unless the command names a folder for them."""
+    if not _SWEEP_FLAGS & set(sys.argv) or any("hydra.sweep." in argument for argument in sys.argv):
+        yield
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        sys.argv.append(f"hydra.sweep.dir='{folder}'")
+        yield
 
 
 def _readable(setting: Setting, value: str) -> str:
