@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import signal
 import sys
 
 import pytest
 
 from torchrl_etdmpc.commands import suite
-from torchrl_etdmpc.suites import attempt, read_experiment
+from torchrl_etdmpc.suites import attempt, read_experiment, read_progress
 from torchrl_etdmpc.suites.attempt import command, end, last_verdict, log_file, note, start
 from torchrl_etdmpc.training import TrainConfig
 
@@ -125,6 +126,17 @@ def test_a_verdict_holds_until_the_next_process_begins(small, tmp_path, monkeypa
     monkeypatch.setattr(attempt, "command", lambda run: [sys.executable, "-S", "-c", ""])
     start(run).wait()
     assert last_verdict(run) is None
+
+
+@pytest.mark.parametrize("table", ["eval.csv", "train.csv"])
+def test_a_verdict_is_over_when_the_run_went_on_by_hand(small, tmp_path, table):
+    (run,) = small.experiment().runs(tmp_path)
+    small.write_tables(run, 200)
+    note(run, "failed", "CUDA out of memory")
+    assert read_progress(run).state == "failed"
+    log = log_file(run).stat()
+    os.utime(run.path / table, ns=(log.st_atime_ns, log.st_mtime_ns + 10**9))
+    assert read_progress(run).state == "stopped"
 
 
 def test_a_verdict_stands_behind_a_line_that_a_killed_process_left_open(small, tmp_path, monkeypatch):

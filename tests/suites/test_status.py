@@ -56,6 +56,12 @@ def test_when_all_is_done_nothing_is_left(small, tmp_path):
     assert status_text(runs, [Progress("finished", 400, 1.0, 2.0)]).endswith("\n\n1 runs: 1 finished")
 
 
+def test_a_run_beyond_the_budget_takes_no_time_from_the_others(small, tmp_path):
+    runs = small.experiment(seeds=(1, 2), budget=360_000).runs(tmp_path)
+    progress = [Progress("stopped", 720_000, 1.0, 50.0), Progress("waiting")]
+    assert status_text(runs, progress).endswith("about 1 h 0 min left with 1 at a time")
+
+
 def test_durations_have_two_units():
     assert [duration(seconds) for seconds in (0.5, 61, 3_599, 7_320, 90_000, math.nan)] == [
         *("1 min", "2 min", "1 h 0 min", "2 h 2 min", "1 d 1 h", "?"),

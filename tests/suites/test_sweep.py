@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -61,6 +62,15 @@ def test_a_trial_is_a_variant_on_every_task_and_seed_with_proposed_settings(sear
     assert config[2] == 0.4
     assert kept == {"tuned trial 0": {"loss.rho": 0.4, "optim.lr": config[0], "model.mlp_dim": config[1]}}
     assert runs[0].path == tmp_path / "tuned trial 0" / "cup-catch" / "seed1"
+
+
+@pytest.mark.parametrize("name", ["what?", "a%20b", "#ü @:"])
+def test_a_study_lies_in_its_folder_whatever_that_is_called(search, tmp_path, name):
+    for most in (1, 2):
+        (tmp_path / name).mkdir(exist_ok=True)
+        sweep = Sweep(search(trials=most), "tuned", tmp_path / name)
+        assert len(sweep.runs() or sweep.propose()) == 1
+        assert [file.relative_to(tmp_path) for file in tmp_path.rglob("*")] == [Path(name), Path(name, "sweeps.sqlite")]
 
 
 def test_ranges_of_whole_numbers_propose_whole_numbers(search, tmp_path):

@@ -108,12 +108,25 @@ def note(run: Run, verdict: Verdict, why: str) -> None:
 
 
 def last_verdict(run: Run) -> tuple[Verdict, str] | None:
-    """What was decided about a run, and why, if no process of it began later."""
+    """What was decided about a run, and why, if no process of it began later, nor one that wrote no log.
+
+    The latter is one that was begun by hand: its tables are newer than the log.
+    """
+    directory = RunDirectory(run.path)
+    if max(map(_changed_at, (directory.eval, directory.train))) > _changed_at(log_file(run)):
+        return None
     last = _last_line(log_file(run))
     for verdict, beginning in _VERDICTS.items():
         if last.startswith(beginning):
             return verdict, last.removeprefix(beginning)
     return None
+
+
+def _changed_at(file: Path) -> int:
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _line_end(log: BinaryIO) -> str:

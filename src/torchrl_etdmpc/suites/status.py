@@ -75,7 +75,8 @@ def _seconds_left(run: Run, entry: Progress, usual: float) -> float:
     if entry.state in ("finished", "pruned", "failed"):
         return 0.0
     speed = usual if math.isnan(entry.decisions_per_second) else entry.decisions_per_second
-    return (run.config.total_env_steps - entry.env_steps) / run.config.task_spec.action_repeat / speed
+    left = max(run.config.total_env_steps - entry.env_steps, 0)  # one that was gone on with by hand may be beyond it
+    return left / run.config.task_spec.action_repeat / speed
 
 
 def duration(seconds: float) -> str:

@@ -182,12 +182,13 @@ class Sweep:
 def _study(file: Path, name: str, search: Search) -> optuna.Study:
     try:
         import optuna
+        from sqlalchemy import URL
     except ImportError as error:
         raise ImportError(f"the search for {name!r} needs Optuna; run: pip install 'optuna>=5,<6'") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         return optuna.create_study(
-            storage=f"sqlite:///{file}",
+            storage=URL.create("sqlite", database=str(file)).render_as_string(),
             study_name=name,
             direction="maximize",
             pruner=optuna.pruners.MedianPruner() if search.prune else optuna.pruners.NopPruner(),
