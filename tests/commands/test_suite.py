@@ -12,7 +12,7 @@ import yaml
 from torchrl_etdmpc import commands
 from torchrl_etdmpc.commands import suite
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.suites import RunQueue, read_experiment
+from torchrl_etdmpc.suites import RunQueue, read_experiment, write_experiment
 
 SMALL = {"preset": "cpu", "device": "cpu", "task.episode_length": 200, "replay.seed_decisions": 40}
 MINE = {
@@ -65,7 +65,7 @@ def trained(monkeypatch):
             run.path.mkdir(parents=True, exist_ok=True)
             row = f"{run.config.total_env_steps},200,0,9.0"
             head = "env_steps,decision_steps,updates,wall_time_s"
-            (run.path / "config.yaml").write_text("task: cup-catch\n")
+            (run.path / "config.yaml").write_text(yaml.safe_dump(run.config.to_dict()))
             (run.path / "train.csv").write_text(f"{head}\n{row}\n")
             (run.path / "eval.csv").write_text(f"{head},return_mean,return_std,episodes\n{row},321.0,0,1\n")
             (run.path / "summary.json").write_text(f'{{"env_steps": {run.config.total_env_steps}}}')
@@ -231,6 +231,18 @@ def test_the_status_needs_none_of_the_settings_that_it_was_begun_with(call, mine
     assert out.splitlines()[-1] == "4 runs: 4 finished"
 
 
+def test_the_status_is_that_of_the_runs_that_are_named(call, mine, trained):
+    call(f"experiment={mine(tasks=['cup-catch', 'reacher-easy'])}", "runs_dir=here")
+    for named, count in {"tasks=reacher-easy": 4, "seeds=[2]": 4, "variants=b": 4, "seeds=1 variants=a": 2}.items():
+        message, out = call("status", "runs_dir=here", *named.split())
+        assert message is None
+        assert out.splitlines()[-1] == f"{count} runs: {count} finished"
+    message, out = call("status", "runs_dir=here", "seeds=[7]")
+    assert message == (
+        f"error: runs_dir={Path.cwd()}/here holds no run of these tasks, seeds and variants; leave some out."
+    )
+
+
 def test_a_run_that_fails_makes_the_command_fail(call, mine, monkeypatch):
     def fail(queue, **places):
         while (run := queue.next()) is not None:
@@ -262,6 +274,7 @@ def test_a_search_adds_its_trials_to_the_experiment(call, mine, trained, tmp_pat
     assert message == 0
     stored = read_experiment(tmp_path / "here" / "experiment.yaml")
     assert [name for name in stored.variants if name.startswith("tuned trial")] == ["tuned trial 0", "tuned trial 1"]
+    assert call("status", "runs_dir=here", "variants=tuned")[1].splitlines()[-1] == "4 runs: 4 finished"
     assert stored.searches["tuned"].trials == 2
     _, out = call("status", "runs_dir=here")
     assert out.splitlines()[-1] == "6 runs: 6 finished"
@@ -340,6 +353,7 @@ def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
         (["experiment=cpu-easy", "tasks="], "tasks must not be empty; leave it out for all that the experiment has."),
         (["experiment=cpu-easy", "seeds="], "seeds must not be empty; leave it out for all that the experiment has."),
         (["experiment=cpu-easy", "variants="], "variants must not be empty; leave it out for all"),
+        (["experiment=cpu-easy", "runs_dir="], "runs_dir must not be empty; leave it out for runs/EXPERIMENT."),
         (["experiment=cpu-easy", "address=auto"], "address is for engine=ray; leave it out with engine=local."),
         (["experiment=cpu-easy", "gpus_per_run=1"], "gpus_per_run is for engine=ray; leave it out with engine=local."),
         (["experiment=cpu-easy", "sbatch=--gres=gpu:1"], "sbatch is for engine=slurm; leave it out with engine=local."),
@@ -385,10 +399,18 @@ def test_a_setting_of_a_variant_that_does_not_exist_is_found_before_anything_sta
     assert not (tmp_path / "here").exists()
 
 
-def test_a_setting_that_only_a_part_refuses_is_found_before_anything_starts(call, mine, trained, tmp_path):
-    code, _ = call(f"experiment={mine(variants={'a': {}, 'b': {'planner.horizon': 0}})}", "runs_dir=here")
-    assert code == "error: variant 'b': planner.horizon must be at least 1, got 0."
-    assert trained == []
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"planner.horizon": 0}, "planner.horizon must be at least 1, got 0."),
+        ({"reanalyze.num_slices": 0}, "reanalyze.num_slices must be at least 1, got 0."),
+        ({"search": {"loss.rho": [0.5, 7.0], "optim.lr": [1e-3, 1e-4]}, "trials": 2}, "loss.rho must be "),
+        ({"search": {"planner.num_elites": {"low": 6, "high": 900}}, "trials": 2}, "planner.num_elites must be "),
+    ],
+)
+def test_a_setting_that_only_a_part_refuses_is_found_before_anything_starts(call, mine, tmp_path, settings, message):
+    code, _ = call(f"experiment={mine(variants={'a': {}, 'b': settings})}", "runs_dir=here", "dry_run=true")
+    assert str(code).startswith(f"error: variant 'b': {message}")
     assert not (tmp_path / "here").exists()
 
 
@@ -402,6 +424,48 @@ def test_an_experiment_that_was_changed_is_never_mixed_with_what_it_was(call, mi
     )
     assert (tmp_path / "here" / "experiment.yaml").read_bytes() == before
     assert len(trained) == 1
+
+
+def begun(run, **loss) -> RunDirectory:
+    """The directory of a run that another version stopped after its first steps; ``None`` is a setting it had not."""
+    directory, values = RunDirectory(run.path), run.config.to_dict()
+    values["loss"] = {name: value for name, value in (values["loss"] | loss).items() if value is not None}
+    directory.begin(values)
+    directory.close()
+    directory.eval.write_text("env_steps,decision_steps,updates,wall_time_s,return_mean\n100,50,0,1,2.0\n")
+    return directory
+
+
+@pytest.mark.parametrize(
+    ("changes", "was"),
+    [
+        ({"rho": 0.7}, "loss.rho=0.7, now it is 0.5"),
+        ({"value_replayed": None}, "loss.value_replayed=0.0, now it is 0.5"),
+    ],
+)
+def test_a_run_that_was_begun_with_other_values_of_its_preset_is_not_mixed_in(
+    call, mine, trained, tmp_path, changes, was
+):
+    file = mine()
+    experiment = read_experiment(Path(file))
+    run = experiment.runs(tmp_path / "here")[1]
+    directory = begun(run, **changes)
+    write_experiment(experiment, tmp_path / "here" / "experiment.yaml")
+    for more in ("dry_run=true", "variants=b", "engine=slurm"):  # the experiment is one, whatever part is trained
+        code, _ = call(f"experiment={file}", "runs_dir=here", more)
+        assert code == f"error: {run.path} was begun with {was}; choose another runs_dir for the changed one."
+    assert trained == []
+    directory.eval.unlink()  # then it ended before its first step, and begins anew
+    assert call(f"experiment={file}", "runs_dir=here", "dry_run=true")[0] is None
+
+
+def test_a_shorter_budget_is_refused_by_its_number(call, mine, trained, tmp_path):
+    call(f"experiment={mine()}", "runs_dir=here")
+    code, _ = call(f"experiment={mine()}", "runs_dir=here", "total_env_steps=300", "dry_run=true")
+    assert code == (
+        f"error: experiment mine was begun in {tmp_path}/here with total_env_steps=400 for variant 'a', now it is 300, "
+        "which is less; choose another runs_dir for the changed one."
+    )
 
 
 def test_the_directory_of_a_run_is_no_folder_for_many(call, mine, tmp_path):
@@ -485,3 +549,25 @@ def test_a_task_of_one_s_own_can_be_given_and_gone_on_with(call, mine, trained, 
         assert code == 0
         assert out.splitlines()[-1] == "4 runs: 4 finished"
     assert trained[0].runs[0].path.parent == Path.cwd() / "here" / "a" / f"{own_module}_task"
+
+
+NO_LIMIT = """
+from torchrl.envs import ActionScaling, GymEnv, TransformedEnv
+def make():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
+    env.base_env._env = env.base_env._env.unwrapped
+    env.base_env._env.spec = None
+    return env
+"""
+
+
+def test_variants_may_have_episodes_of_their_own_of_a_task_that_shows_no_limit(call, mine, own_module, tmp_path):
+    pytest.importorskip("gymnasium")
+    (tmp_path / f"{own_module}.py").write_text(NO_LIMIT)
+    task = f"tasks={own_module}:make"
+    settings = {"preset": "cpu", "task.terminates": False, "replay.seed_decisions": 40}
+    lengths = {"short": {"task.episode_length": 100}, "long": {"task.episode_length": 200}}
+    code, out = call(f"experiment={mine(settings=settings, variants=lengths)}", task, "dry_run=true")
+    assert code is None and "task.episode_length=100" in out and "task.episode_length=200" in out
+    code, _ = call(f"experiment={mine(settings=settings, variants=lengths | {'a': {}})}", task, "dry_run=true")
+    assert str(code).endswith("shows no time limit; give one in env steps: task.episode_length=")

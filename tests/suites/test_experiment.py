@@ -336,6 +336,20 @@ def test_a_search_may_have_more_trials_but_no_other_space_tasks_seeds_or_budget(
             extended(stored, read_experiment(write(**changes, base=None)), tmp_path)
 
 
+def test_a_search_goes_on_with_its_tasks_and_seeds_in_another_order(write, tmp_path):
+    search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 2}
+    both = [["walker-walk", "cup-catch"], [1, 2]], [["cup-catch", "walker-walk"], [2, 1]]
+    stored, asked = (read_experiment(write(variants={"a": search}, base=None, tasks=t, seeds=s)) for t, s in both)
+    assert extended(stored, asked, tmp_path).tasks == ("walker-walk", "cup-catch")
+
+
+def test_a_shorter_budget_is_refused(write, tmp_path):
+    stored = read_experiment(write(variants={"a": {}, "long": {"total_env_steps": 90_000}}, base=None))
+    asked = read_experiment(write(variants={"b": {}}, base=None, budget=49_999))
+    with pytest.raises(ValueError, match="with total_env_steps=50000 for variant 'a', now it is 49999, which is less"):
+        extended(stored, asked, tmp_path)
+
+
 def test_env_steps_among_the_settings_are_the_budget(write, tmp_path):
     experiment = read_experiment(write(budget=None, settings={"preset": "cpu", "total_env_steps": 30_000}))
     assert experiment.budget == 30_000

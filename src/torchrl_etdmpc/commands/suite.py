@@ -26,6 +26,7 @@ from torchrl_etdmpc.suites import (
     extended,
     find_experiment,
     read_experiment,
+    require_unchanged,
     run_locally,
     run_on_ray,
     status_text,
@@ -38,6 +39,8 @@ from torchrl_etdmpc.training import (
     TASK_SETTINGS,
     TrainConfig,
     build_agent,
+    build_reanalyze,
+    build_replay,
     config_from_dict,
     follow_own_code,
 )
@@ -61,6 +64,13 @@ INSTEAD = {
     "resume": "leave it out, every run goes on from where it is",
 }
 """Settings of train that a command line of a suite must not hold, and what to write."""
+
+
+LEFT_OUT = {
+    **dict.fromkeys(("tasks", "seeds", "variants"), "all that the experiment has"),
+    "runs_dir": "runs/EXPERIMENT",
+}
+"""What settings that must not be empty stand for where they are left out."""
 
 
 OF_ENGINE = {"local": ("per_gpu",), "ray": ("address", "cpus_per_run", "gpus_per_run"), "slurm": ("sbatch",)}
@@ -133,17 +143,22 @@ def main() -> None:
     if RunDirectory(folder).holds_a_run:
         raise ValueError(f"runs_dir={folder} is the directory of a run; choose a folder for many of them.")
     stored = _stored(folder)
-    _import_own_code(config, settings, [asked] if stored is None else [asked, stored])
+    known = [asked] if stored is None else [stored] if words else [stored, asked]
+    _import_own_code(config, settings, known)
     if words == ["status"]:
         if stored is None:
             raise FileNotFoundError(f"runs_dir={folder} holds no experiment; begin it, or name its folder.")
-        runs = stored.runs(folder)
+        runs = _named(config, asked, stored.runs(folder))
+        if not runs:
+            raise ValueError(f"runs_dir={folder} holds no run of these tasks, seeds and variants; leave some out.")
         print(status_text(runs, RunIndex(folder / "index.sqlite").read(runs), config.workers or 1))
         return
     whole = asked if stored is None else extended(stored, asked, folder)
     runs = asked.runs(folder)
     _require_differences(whole, folder)
-    _require_parts(runs)
+    _require_parts([*{run.variant: run.config for run in runs}.items(), *asked.proposals(asked.tasks[0])])
+    with console():
+        require_unchanged(whole.runs(folder))
     if config.dry_run:
         print(_plan(asked, runs))
         return
@@ -186,13 +201,26 @@ def _require_differences(experiment: Experiment, folder: Path) -> None:
             )
 
 
-def _require_parts(runs: Iterable[Run]) -> None:
-    """Makes the networks and planners of each variant once: some settings are checked by the parts alone."""
-    for run in {run.variant: run for run in runs}.values():
+def _require_parts(configs: Iterable[tuple[str, TrainConfig]]) -> None:
+    """Makes the parts of each variant once: some settings are checked by them alone."""
+    for variant, config in configs:
         try:
-            build_agent(dataclasses.replace(run.config, compile="off"), 3, 1)
+            agent = build_agent(dataclasses.replace(config, compile="off"), 3, 1)
+            build_reanalyze(config, agent, build_replay(config))
         except ValueError as error:
-            raise ValueError(f"variant {run.variant!r}: {error}") from error
+            raise ValueError(f"variant {variant!r}: {error}") from error
+
+
+def _named(config: SuiteConfig, asked: Experiment, runs: list[Run]) -> list[Run]:
+    """The runs of the tasks, seeds and variants that the command names; a search's name is of all its trials."""
+    trials = tuple(f"{search} trial " for search in asked.searches)
+    return [
+        run
+        for run in runs
+        if (not config.tasks or run.task in asked.tasks)
+        and (not config.seeds or run.seed in asked.seeds)
+        and (not config.variants or run.variant in asked.variants or run.variant.startswith(trials))
+    ]
 
 
 def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: Path) -> int:
@@ -245,15 +273,24 @@ def _import_own_code(config: SuiteConfig, settings: dict[str, Any], experiments:
     for name, value in settings.items():
         if isinstance(value, str):
             follow_own_code(name, value)
-    tasks = {task: experiment for experiment in experiments for task in experiment.tasks}
     for path in (path for path in (*_listed(config.tasks), *_listed(config.code)) if ":" in path):
-        if path in tasks:
-            told = {**tasks[path].settings, **settings}
-            names = {name: told.get(f"task.{name}", told.get(name)) for name in TASK_SETTINGS}
-            import_task(path, **names)
+        told = [{**own, **settings} for one in experiments if path in one.tasks for own in _of_each_variant(one)]
+        if told:
+            import_task(path, **{name: _of_all(told, name) for name in TASK_SETTINGS})
         else:
             for setting in ("planner.score", "reanalyze.score", "loss.extra_terms"):
                 follow_own_code(setting, path)
+
+
+def _of_each_variant(experiment: Experiment) -> list[dict[str, Any]]:
+    proposed = ({**search.settings, **search.points()[0]} for search in experiment.searches.values())
+    return [{**experiment.settings, **own} for own in (*experiment.variants.values(), *proposed)]
+
+
+def _of_all(told: Iterable[dict[str, Any]], name: str) -> Any:
+    """A setting of a task for its import: the first one if every variant says its own, which then counts."""
+    values = [own.get(f"task.{name}", own.get(name)) for own in told]
+    return None if None in values else values[0]
 
 
 def _typed(setting: Setting, text: str, as_it_is: bool) -> Any:
@@ -272,8 +309,8 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
         if not equals:
             continue
         name = f"task.{name}" if f"task.{name}" in training else name
-        if not text and name in ("tasks", "seeds", "variants"):  # of an unset variable of the shell
-            raise ValueError(f"{name} must not be empty; leave it out for all that the experiment has.")
+        if not text and name in LEFT_OUT:  # of an unset variable of the shell
+            raise ValueError(f"{name} must not be empty; leave it out for {LEFT_OUT[name]}.")
         if name in own:
             value = _typed(own[name], text, own[name].is_text or bool(own[name].choices))
             values |= {} if value is None else {name: value}  # the default of all that may be null

@@ -8,6 +8,7 @@ from torchrl_etdmpc.suites.experiment import (
     extended,
     find_experiment,
     read_experiment,
+    require_unchanged,
     write_experiment,
 )
 from torchrl_etdmpc.suites.index import Progress, RunIndex, read_progress
@@ -31,6 +32,7 @@ __all__ = [
     "find_experiment",
     "read_experiment",
     "read_progress",
+    "require_unchanged",
     "run_locally",
     "run_on_ray",
     "status_text",

@@ -14,10 +14,10 @@ import yaml
 
 from torchrl_etdmpc.analysis import BENCHMARKS
 from torchrl_etdmpc.envs import DMC_TASKS
-from torchrl_etdmpc.runs import DamagedFileError
+from torchrl_etdmpc.runs import DamagedFileError, RunDirectory
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.runs.files import read_whole, write_whole
-from torchrl_etdmpc.training import CHANGEABLE, TASK_SETTINGS, TrainConfig, preset
+from torchrl_etdmpc.training import CHANGEABLE, TASK_SETTINGS, TrainConfig, preset, read_run_config
 
 TASK_SETS: dict[str, tuple[str, ...]] = {
     **{name: benchmark.tasks for name, benchmark in BENCHMARKS.items()},
@@ -123,7 +123,7 @@ class Search:
             for name, values in self.space.items()
         }
         first = {name: values[0] for name, values in ends.items()}
-        return [first | {name: value} for name, values in ends.items() for value in values]
+        return [first, *(first | {name: value} for name, values in ends.items() for value in values[1:])]
 
 
 @dataclass(frozen=True)
@@ -226,16 +226,22 @@ class Experiment:
                 return benchmark.budget
         raise ValueError(f"{task} is of no benchmark, so budget must be a number of env steps.")
 
+    def proposals(self, task: str) -> list[tuple[str, TrainConfig]]:
+        """Names of the searches and the settings that :meth:`Search.points` comes to on a task, checked."""
+        return [
+            (name, self._config(name, {**search.settings, **point}, task, self.seeds[0]))
+            for name, search in self.searches.items()
+            for point in search.points()
+        ]
+
     def runs(self, folder: Path) -> list[Run]:
         """Every run of the variants, each in a directory of its own below ``folder``: ``variant/task/seedN``.
 
         Raises:
             ValueError: as :meth:`config` does, also for what a search may propose, before anything is made.
         """
-        for name, search in self.searches.items():
-            for point in search.points():
-                for task in self.tasks:
-                    self._config(name, {**search.settings, **point}, task, self.seeds[0])
+        for task in self.tasks:
+            self.proposals(task)
         runs = []
         for variant in self.variants:
             for task in self.tasks:
@@ -363,8 +369,8 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
     """
     for name, search in asked.searches.items():
         before = dataclasses.replace(stored.searches.get(name, search), trials=search.trials, prune=search.prune)
-        same = all(getattr(stored, what) == getattr(asked, what) for what in ("tasks", "seeds", "budget"))
-        if name in stored.searches and not (same and before == search):
+        uses = [(set(one.tasks), set(one.seeds), one.budget) for one in (stored, asked)]
+        if name in stored.searches and not (uses[0] == uses[1] and before == search):
             raise ValueError(
                 f"experiment {asked.name} was begun in {folder} with another space, other tasks, seeds or budget for "
                 f"the search {name!r}, whose trials would not compare; choose another runs_dir for the changed one."
@@ -379,15 +385,49 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
     )
     for variant in stored.variants:
         for task in stored.tasks:
-            old, new = (flat(one.config(variant, task, stored.seeds[0]).to_dict()) for one in (stored, both))
-            changed = [name for name in new if old.get(name) != new[name] and name not in CHANGEABLE]
+            old, new = (one.config(variant, task, stored.seeds[0]) for one in (stored, both))
+            changed = _changed(old, new)
+            if new.total_env_steps < old.total_env_steps:
+                changed = f"total_env_steps={old.total_env_steps}", f"{new.total_env_steps}, which is less"
             if changed:
-                name = f"task.{changed[0]}" if changed[0] in TASK_SETTINGS else changed[0]
                 raise ValueError(
-                    f"experiment {asked.name} was begun in {folder} with {name}={old.get(changed[0])} for variant "
-                    f"{variant!r}, now it is {new[changed[0]]}; choose another runs_dir for the changed one."
+                    f"experiment {asked.name} was begun in {folder} with {changed[0]} for variant {variant!r}, now it "
+                    f"is {changed[1]}; choose another runs_dir for the changed one."
                 )
     return both
+
+
+def require_unchanged(runs: Iterable[Run]) -> None:
+    """Refuses to go on with runs that were begun with other settings, as by a version whose presets differ.
+
+    Args:
+        runs (iterable of Run): of an experiment; those that have not begun are passed over.
+
+    Raises:
+        ValueError: naming the first one, its setting and both values; or if a run's settings cannot be read.
+
+    >>> experiment = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
+    >>> require_unchanged(experiment.runs(Path("runs/nowhere")))
+    """
+    for run in runs:
+        directory = RunDirectory(run.path)
+        if not directory.config.exists():
+            continue
+        changed = _changed(read_run_config(directory), run.config)
+        if changed and not directory.leftover:
+            raise ValueError(
+                f"{run.path} was begun with {changed[0]}, now it is {changed[1]}; choose another runs_dir for the "
+                "changed one."
+            )
+
+
+def _changed(old: TrainConfig, new: TrainConfig) -> tuple[str, str] | None:
+    """The first setting that differs and may not: with its old value as it is typed, and the new value."""
+    before, now = flat(old.to_dict()), flat(new.to_dict())
+    for name, value in now.items():
+        if before[name] != value and name not in CHANGEABLE:
+            return f"{'task.' * (name in TASK_SETTINGS)}{name}={before[name]}", str(value)
+    return None
 
 
 def write_experiment(experiment: Experiment, file: Path) -> None:
