@@ -404,7 +404,7 @@ def require_unchanged(runs: Iterable[Run]) -> None:
         runs (iterable of Run): of an experiment; those that have not begun are passed over.
 
     Raises:
-        ValueError: naming the first one, its setting and both values; or if a run's settings cannot be read.
+        ValueError: naming the first one, its setting and both values.
 
     >>> experiment = Experiment("heads", ("walker-walk",), (1,), {"cpu": {"preset": "cpu"}}, budget=50_000)
     >>> require_unchanged(experiment.runs(Path("runs/nowhere")))
@@ -413,7 +413,10 @@ def require_unchanged(runs: Iterable[Run]) -> None:
         directory = RunDirectory(run.path)
         if not directory.config.exists():
             continue
-        changed = _changed(read_run_config(directory), run.config)
+        try:
+            changed = _changed(read_run_config(directory), run.config)
+        except ValueError:  # one that cannot be gone on with says so itself, and stops no other
+            continue
         if changed and not directory.leftover:
             raise ValueError(
                 f"{run.path} was begun with {changed[0]}, now it is {changed[1]}; choose another runs_dir for the "
