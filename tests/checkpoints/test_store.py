@@ -3,10 +3,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import defaultdict
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -138,6 +140,24 @@ def test_a_checkpoint_holds_one_file_for_each_part_and_a_manifest(store):
     }
     assert {path.name for path in store.folder.iterdir()} == {"resume", "replay", "last.pt"}
     assert {path.name for path in (store.folder / "replay").iterdir()} == replay_files(store.folder)
+
+
+@pytest.mark.parametrize(
+    ("foreign", "named"),
+    [
+        (np.float64(3), r"\['history'\]\[1\]\['x'\] is of type numpy\.float64"),
+        (np.random.get_state(), r"\['history'\]\[1\]\['x'\]\[1\] is of type numpy\.ndarray"),
+        (Path("here"), r"\['history'\]\[1\]\['x'\] is of type pathlib\.PosixPath"),
+        (defaultdict(list), r"\['history'\]\[1\]\['x'\] is of type collections\.defaultdict"),
+    ],
+)
+def test_a_state_that_no_load_would_read_is_not_saved(store, foreign, named):
+    work = Work().do()
+    state = save(store, 100, work)
+    work.counter.history = ["step 1", {"x": foreign}]
+    with pytest.raises(TypeError, match=f"^the state of the part 'counter'{named}; a checkpoint holds tensors"):
+        CheckpointStore(store.folder).save(200, work.parts, work.buffer)
+    assert load(store.folder) == (f"{100:012d}", state)
 
 
 def test_the_buffer_is_restored_first_and_then_the_parts_in_the_order_of_the_mapping(store):

@@ -194,3 +194,12 @@ def test_autocast_leaves_the_cross_entropy_of_half_precision_logits_in_single_pr
     with torch.autocast("cpu", torch.bfloat16):
         error = two_hot_cross_entropy(logits, target, BINS)
     torch.testing.assert_close(error, two_hot_cross_entropy(logits.float(), target, BINS), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_bins_in_half_precision_mean_what_they_mean_in_single(dtype):
+    bins, x = torch.linspace(-10, 10, 21), torch.tensor([0.0, 1.0, 7.0, 100.0])
+    weights = two_hot_encode(x, bins.to(dtype))
+    torch.testing.assert_close(weights, two_hot_encode(x, bins), rtol=0, atol=1e-6)
+    rounded = two_hot_encode(x.to(dtype), bins.to(dtype))  # these four are numbers of half precision too
+    torch.testing.assert_close(rounded, weights, rtol=0, atol=1e-6)

@@ -98,3 +98,15 @@ def test_an_encoder_of_ones_own_standardises_by_itself():
         "normalize_observations is for the encoder that is built here; put a RunningNorm into your own, and a method "
         "observe(observation, counts) that moves it."
     )
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_statistics_move_on_where_the_module_is_cast_to_half_precision(dtype):
+    exact, cast = RunningNorm(2), RunningNorm(2)
+    cast.to(dtype)
+    assert cast(torch.zeros(2, dtype=dtype)).dtype == dtype
+    for batch in torch.randn(300, 32, 2) + torch.linspace(0, 10, 300)[:, None, None]:
+        exact.observe(batch)
+        cast.observe(batch.to(dtype))
+    torch.testing.assert_close(cast.mean, exact.mean, rtol=1e-3, atol=0)
+    torch.testing.assert_close(cast.variance, exact.variance, rtol=1e-2, atol=0)

@@ -9,7 +9,7 @@ from torchrl.data import MultiStep
 from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
-from torchrl_etdmpc.objectives import EfficientTDMPCLoss, TDMPC2Loss
+from torchrl_etdmpc.objectives import EfficientTDMPCLoss, EfficientTDMPCModelLoss, TDMPC2Loss
 from torchrl_etdmpc.testing import random_slices
 
 
@@ -231,6 +231,23 @@ def test_half_precision_leaves_the_discount_as_it_is():
     assert torch.isfinite(loss(batch.apply(lambda x: x.bfloat16() if x.is_floating_point() else x))["loss_value"])
     for dtype in (torch.float64, torch.float32):
         assert loss.to(dtype).discount.dtype == dtype
+
+
+def test_a_loss_without_targets_saves_the_statistics_of_a_model_that_was_cast_without_it():
+    model = WorldModel(5, 3, latent_dim=16, mlp_dim=16, normalize_observations=True)
+    loss = EfficientTDMPCModelLoss(model)
+    model.double()
+    batch = random_slices(5, 3).apply(lambda x: x.double() if x.is_floating_point() else x)
+    loss(batch)
+    saved = loss.state_dict()
+    statistics = {name: value for name, value in saved.items() if name.endswith("mean")}
+    assert statistics
+    for name, value in model.encoder.named_buffers():
+        torch.testing.assert_close(saved[f"encoder_params.{name}"], value)
+    assert any(value.abs().sum() > 0 for value in statistics.values())
+    held = loss.encoder_params
+    loss.state_dict()
+    assert loss.encoder_params is held  # read anew only where there was something to read
 
 
 @pytest.mark.parametrize(("kind", "name"), [("efficient", "kl_scale"), ("tdmpc2", "q_scale")])

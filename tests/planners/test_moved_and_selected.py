@@ -155,3 +155,16 @@ def test_specs_follow_a_world_model_that_its_loss_casts_or_moves():
     assert reset["latent"].dtype == latent.observation_spec["latent"].dtype == torch.float32
     model.to("meta")  # in the place of a GPU
     assert planner.spec["action"].device.type == planner.spec["plan", "loc"].device.type == "meta"
+
+
+@pytest.mark.parametrize("scoring_dtype", [None, "float64"])
+def test_a_planner_whose_environment_gets_another_model_plans_with_that_one(scoring_dtype):
+    torch.manual_seed(0)
+    planner, other = (make_planner(scoring_dtype=scoring_dtype) for _ in range(2))
+    observation = torch.randn(4, 3)
+    noise = planner.draw_noise(4)
+    planner.plan(observation, noise=noise)
+    planner.env = other.env
+    for mine, theirs in zip(planner.plan(observation, noise=noise), other.plan(observation, noise=noise), strict=True):
+        if isinstance(mine, torch.Tensor):
+            torch.testing.assert_close(mine, theirs, rtol=0, atol=0)

@@ -258,6 +258,20 @@ def test_parameters_with_other_memory_are_an_error_and_not_lost_updates(move):
         updater.step(make_batch())
 
 
+@pytest.mark.parametrize("frozen_first", [True, False])
+def test_what_is_frozen_or_thawed_after_the_updater_was_made_needs_a_new_one(frozen_first):
+    world_model = make_world_model()
+    world_model.encoder.requires_grad_(not frozen_first)
+    updater = make_updater(world_model)
+    seeded_step(updater, make_batch())
+    world_model.encoder.requires_grad_(frozen_first)
+    with pytest.raises(RuntimeError, match=r"^parameters of the loss were frozen, .*; make a new Updater"):
+        updater.step(make_batch())
+    before = next(world_model.encoder.parameters()).clone()
+    seeded_step(make_updater(world_model), make_batch())
+    assert torch.equal(next(world_model.encoder.parameters()), before) != frozen_first
+
+
 def test_a_copied_updater_is_refused_too():
     updater = copy.deepcopy(make_updater())
     with pytest.raises(RuntimeError, match="been moved"):

@@ -30,6 +30,7 @@ from torchrl_etdmpc.runs.files import (
     read_tensors,
     read_whole,
     remove_partial_files,
+    require_readable,
     sync,
     write_tensors,
     write_whole,
@@ -91,6 +92,8 @@ class CheckpointStore:
         self.folder = Path(folder)
         self.keep = keep
         self.journal = ReplayJournal(self.folder / "replay", plan_key=plan_key)
+        self._readable: set[str] = set()
+        """Parts whose first state could be read back."""
 
     def save(
         self,
@@ -118,6 +121,7 @@ class CheckpointStore:
 
         Raises:
             OSError: if it cannot be written; nothing is left of the attempt.
+            TypeError: if the state of a part holds more than tensors and plain containers, which no load would read.
         """
         target = self.folder / "resume" / f"{step:012d}"
         partial = target.with_name(f".{target.name}.partial")
@@ -126,9 +130,13 @@ class CheckpointStore:
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
             replay = self.journal.save(buffer, version=version)
-            files = {
-                name: write_tensors(partial / f"{name}.pt", dict(part.state_dict())) for name, part in parts.items()
-            }
+            files = {}
+            for name, part in parts.items():
+                state = dict(part.state_dict())
+                if name not in self._readable:
+                    require_readable(state, f"the state of the part {name!r}")
+                    self._readable.add(name)
+                files[name] = write_tensors(partial / f"{name}.pt", state)
             manifest = {"format": FORMAT, "files": files, "replay": replay}
             write_whole(partial / "manifest.json", json.dumps(manifest | {"sha256": _checksum(manifest)}))
             for path, name in (links or {}).items():  # before the checkpoint: its parts may say that this was done

@@ -39,17 +39,19 @@ def two_hot_encode(x: Tensor, bins: Tensor) -> Tensor:
         bins (Tensor): bin centres in symlog space, evenly spaced and ascending, shape ``[M]`` with M >= 2.
 
     Returns:
-        Tensor: weights that sum to one, shape ``[..., M]``.
+        Tensor: weights that sum to one, shape ``[..., M]``, in single precision at least.
 
     >>> bins = torch.linspace(-10, 10, 101)
     >>> two_hot_encode(torch.tensor(0.0), bins)[50].item()
     1.0
     """
     num_bins = bins.shape[-1]
-    x = x.to(torch.promote_types(x.dtype, bins.dtype))  # half precision places a scalar in steps of half a bin
-    width = (bins[-1] - bins[0]) / (num_bins - 1)
-    position = ((symlog(x) - bins[0]) / width).clamp(0, num_bins - 1)
-    index = torch.arange(num_bins, device=bins.device, dtype=bins.dtype)
+    # Half precision places a scalar in steps of half a bin, and has another width than the bins.
+    dtype = torch.promote_types(torch.promote_types(x.dtype, bins.dtype), torch.float32)
+    low, high = bins[0].to(dtype), bins[-1].to(dtype)
+    width = (high - low) / (num_bins - 1)
+    position = ((symlog(x.to(dtype)) - low) / width).clamp(0, num_bins - 1)
+    index = torch.arange(num_bins, device=bins.device, dtype=dtype)
     return (1 - (position.unsqueeze(-1) - index).abs()).clamp_min(0)
 
 

@@ -20,6 +20,7 @@ class RunningNorm(nn.Module):
     reacher, an arm that spins turns by tens of radians, and the way to the target is a tenth of a metre. (SimBa,
     arXiv:2410.09754, standardises so; not in the thesis.)
 
+    Statistics stay in single precision where the module is cast to half, in which they would stop moving.
     Moved by :meth:`observe` alone. The losses call it in training mode with every batch, as they move their running
     scales, so that planner, targets and policy see one and the same statistic: that of the replayed observations.
 
@@ -58,6 +59,15 @@ class RunningNorm(nn.Module):
         self.mean.copy_(mean)
         self.variance.copy_(variance)
 
+    def _apply(self, fn, recurse: bool = True):
+        exact = {name: self.get_buffer(name) for name in ("mean", "variance")}
+        super()._apply(fn, recurse)
+        for name, before in exact.items():
+            now = self.get_buffer(name)
+            if now.element_size() < 4:
+                self.register_buffer(name, before.to(now.device))
+        return self
+
     def reset_parameters(self) -> None:
         """Forgets what was seen."""
         self.mean.zero_()
@@ -66,4 +76,4 @@ class RunningNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``[..., O] -> [..., O]``."""
-        return ((x - self.mean) * (self.variance + EPSILON).rsqrt()).clamp(-LARGEST, LARGEST)
+        return ((x - self.mean) * (self.variance + EPSILON).rsqrt()).clamp(-LARGEST, LARGEST).to(x.dtype)

@@ -275,7 +275,16 @@ class LatentRolloutLoss(LossModule):
             if f"{name}_params" in self._modules:
                 self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
 
+    def _holds_other_buffers(self, name: str) -> bool:
+        """Whether a network has got other buffers since they were read, as by a cast of the world model alone."""
+        held = self._modules[f"{name}_params"].values(True, True)  # pyright: ignore[reportOptionalMemberAccess]
+        known = {value.data_ptr() for value in held if not isinstance(value, nn.Parameter)}
+        return known != {buffer.data_ptr() for buffer in self.__dict__[name].buffers()}
+
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        self._refuse_other_weights()
+        if any(self._holds_other_buffers(name) for name in self._attributes if f"{name}_params" in self._modules):
+            self._read_networks()
         super()._save_to_state_dict(destination, prefix, keep_vars)
         # The world model is not a submodule, but who restores the weights restores the number of updates in them.
         destination[f"{prefix}version"] = self.world_model.version.detach()

@@ -587,7 +587,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         """The weights in the scoring dtype, or ``None`` where that is their own."""
         if self.scoring_dtype is None or self.scoring_dtype == latent.dtype:
             return None
-        return {name: weight.to(self.scoring_dtype) for name, weight in self._imagination.named_parameters()}
+        return {name: weight.to(self.scoring_dtype) for name, weight in self._imagined().named_parameters()}
+
+    def _imagined(self) -> _Imagination:
+        """That of the model which the planner has now: its environment may have been given another one."""
+        if self._imagination.world_model is not self.world_model:
+            vars(self)["_imagination"] = _Imagination(self.world_model)
+        return self._imagination
 
     def _evaluate(
         self,
@@ -620,12 +626,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         """The return table, by weights that are cast once for many calls."""
         options: dict[str, Any] = {"discount": self.discount, "all_depths": self.score.depths == "all"}
         if weights_cast is None:
-            return self._imagination(latent, actions, bootstrap=bootstrap, **options)
+            return self._imagined()(latent, actions, bootstrap=bootstrap, **options)
         if bootstrap is not None:
             bootstrap = bootstrap[0].to(self.scoring_dtype), bootstrap[1]
         inputs = latent.to(self.scoring_dtype), actions.to(self.scoring_dtype)
         options |= {"bootstrap": bootstrap, "dtype": latent.dtype}
-        return functional_call(self._imagination, weights_cast, inputs, options)
+        return functional_call(self._imagined(), weights_cast, inputs, options)
 
 
 class _Search(NamedTuple):

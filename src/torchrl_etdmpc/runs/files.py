@@ -157,6 +157,24 @@ def write_tensors(path: Path, content: Any) -> dict[str, Any]:
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
+def require_readable(content: Any, name: str) -> None:
+    """Raises a TypeError that names the entry which :func:`load_tensors` would refuse: of NumPy, or of a class.
+
+    >>> require_readable({"steps": 3, "weights": torch.zeros(2)}, "the state")
+    """
+    try:
+        load_tensors(pack_tensors(content), Path(name))
+    except DamagedFileError:
+        inner = content.items() if isinstance(content, dict) else ()
+        inner = enumerate(content) if isinstance(content, list | tuple) else inner
+        for key, value in inner:
+            require_readable(value, f"{name}[{key!r}]")
+        raise TypeError(
+            f"{name} is of type {type(content).__module__}.{type(content).__qualname__}; a checkpoint holds tensors, "
+            "numbers, texts and plain containers only, so convert it."
+        ) from None
+
+
 def read_tensors(path: Path, stamp: Mapping[str, Any]) -> Any:
     """Reads a file of :func:`write_tensors` without running any code in it.
 

@@ -34,7 +34,7 @@ class Updater:
 
     The weights of each part move into one piece of memory, of which the parameters become views, so that clipping, Adam
     and the target average are a few operations whatever the number of layers. Parameters that get new memory afterwards
-    (``.to()``, ``copy.deepcopy``) need a new updater; :meth:`step` says so.
+    (``.to()``, ``copy.deepcopy``), or are frozen or thawed, need a new updater; :meth:`step` says so.
 
     Args:
         loss (LatentRolloutLoss): e.g. :class:`~torchrl_etdmpc.objectives.EfficientTDMPCLoss`,
@@ -113,6 +113,8 @@ class Updater:
         self._other_targets = [(target.data, leader.data) for pairs in followed.values() for target, leader in pairs]
         self._views = [p for tensors in self.parts.values() for p in tensors]
         self._addresses = [p.data_ptr() for p in self._views]
+        self._all = [*loss.parameters()]
+        self._trained = [p.requires_grad for p in self._all]
         device = self._views[0].device
         groups: list[tuple[tuple[str, ...], dict[str, float]]] = [
             (("encoder",), {"lr": lr * encoder_lr_scale}),
@@ -151,10 +153,14 @@ class Updater:
             TensorDictBase: losses, metrics and gradient norms, detached scalars on the device.
 
         Raises:
-            RuntimeError: if parameters of the loss have been given other memory.
+            RuntimeError: if parameters of the loss have been given other memory, or were frozen or thawed.
         """
         if [p.data_ptr() for p in self._views] != self._addresses:
             raise RuntimeError("the loss's parameters have been moved; make a new Updater for this loss.")
+        if [p.requires_grad for p in self._all] != self._trained:
+            raise RuntimeError(
+                "parameters of the loss were frozen, or are so no more; make a new Updater for this loss."
+            )
         if distill is not None and self.loss.distill != distill:
             self.loss.distill = distill
         inputs = self.loss.slices(batch), self.loss.targets()
