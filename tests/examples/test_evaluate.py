@@ -17,6 +17,7 @@ pytest.importorskip("hydra")
 from torchrl_etdmpc.collectors import Episodes, evaluate  # noqa: E402
 from torchrl_etdmpc.commands.agent_command import AgentCommandConfig  # noqa: E402
 from torchrl_etdmpc.envs import get_task, make_env  # noqa: E402
+from torchrl_etdmpc.envs.layers import simulator_of  # noqa: E402
 from torchrl_etdmpc.inspector import with_settings  # noqa: E402
 from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
@@ -189,12 +190,12 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, sav
     pictures, films = [], []
 
     def render_frame(env):
-        pictures.append(torch.zeros(2, 2, 3, dtype=torch.uint8))
+        pictures.append(torch.as_tensor(simulator_of(env)._env.unwrapped.data.qpos.copy()))
         return pictures[-1]
 
     monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.render_frame", render_frame)
     monkeypatch.setattr(
-        "torchrl_etdmpc.commands.evaluate.write_film", lambda frames, path, fps: films.append(len(frames))
+        "torchrl_etdmpc.commands.evaluate.write_film", lambda frames, path, fps: films.append(torch.stack(frames))
     )
     message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "device=cpu", "video=a.mp4")
     assert (message, err) == (None, "")
@@ -202,7 +203,12 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, sav
     first = evaluate(make_env(config.task_spec, seed=0), BarePolicy(agent.world_model), episodes=1).returns
     assert first.item() < 200  # every decision upright is worth 1
     envs = make_env(config.task_spec, seed=0, num_envs=3, parallel=False)
-    assert films == [evaluate(envs, BarePolicy(agent.world_model), episodes=3).lengths[0].item()]
+    seen = []  # observations of InvertedPendulum begin with its positions
+    played = evaluate(
+        envs, BarePolicy(agent.world_model), episodes=3, on_step=lambda step: seen.append(step["observation"][0, :2])
+    )
+    length = played.lengths[0].item()
+    torch.testing.assert_close(films[0], torch.stack(seen[:length]).double(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("policy", ["bare", "planner"])

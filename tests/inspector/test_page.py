@@ -492,3 +492,28 @@ def test_what_is_shown_is_saved_whatever_the_controls_say_by_now(with_replay, tm
         said = ask(app, "saved.children", "save.n_clicks", **shown)
         assert said == {"saved": {"children": f"saved: {tmp_path / 'page' / 'index.html'}"}}
         assert ('class="here"><img alt="step 3"' in (tmp_path / "page" / "index.html").read_text()) == marked
+
+
+def test_a_plan_that_was_begun_before_another_was_held_comes_in_the_held_one_s_components(with_replay):
+    app = make_page(with_replay)
+    held = number_of(with_replay, State(0, 3, replay=True))
+    at = {"source": "replay", "episode": 0, "step": 7, "seed": 5}
+    alone = ask(app, "trace-a.data", "step.value", **at)["trace-a"]["data"]
+    assert not np.allclose(with_replay.traces[alone]["basis"], with_replay.traces[held]["basis"])
+    seen = ask(app, "trace-a.data", "poll.n_intervals", job=1, **at, **{"trace-b": held})
+    while "trace-a" not in seen:
+        seen = ask(app, "trace-a.data", "poll.n_intervals", job=1, **at, **{"trace-b": held})
+    beside = with_replay.traces[seen["trace-a"]["data"]]
+    np.testing.assert_allclose(beside["basis"], with_replay.traces[held]["basis"])
+    np.testing.assert_allclose(beside["scores"], with_replay.traces[alone]["scores"])
+
+
+def test_a_plan_that_is_no_longer_kept_is_not_saved_without_a_word(with_replay, tmp_path):
+    app = make_page(with_replay)
+    shown = number_of(with_replay, State(0, 3, replay=True))
+    folder = {"folder": str(tmp_path / "page")}
+    assert ask(app, "saved.children", "save.n_clicks", **folder)["saved"]["children"] == "There is nothing to save yet."
+    gone = "is no longer kept, as the last 16 are; plan it again."
+    for one, two, which in ((shown + 1, None, "This plan"), (shown, shown + 1, "The held plan")):
+        said = ask(app, "saved.children", "save.n_clicks", **folder, **{"trace-a": one, "trace-b": two})
+        assert said["saved"]["children"] == f"{which} {gone}"

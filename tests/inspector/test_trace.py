@@ -345,9 +345,19 @@ def counted_proposals(manifest, arrays):
     arrays["proposals"] = np.full(24, 99)
 
 
+def without_shares(manifest, arrays):
+    del arrays["explained"]
+
+
+def without_start(manifest, arrays):
+    del arrays["start_point"]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (without_shares, "a trace with the array 'points' needs 'explained', which is missing"),
+        (without_start, "a trace with the array 'chosen_points' needs 'start_point', which is missing"),
         (newer, "has trace format 2 and this version reads 1; use the version of"),
         (foreign, "is not a trace of torchrl_etdmpc; write one with"),
         (bare_manifest, "is not a whole trace: its manifest lacks settings"),

@@ -25,7 +25,7 @@ from torchrl_etdmpc.training import load_agent, resolve_device
 from torchrl_etdmpc.training.config import MOST_EPISODES
 
 GIF_SIZE = 200  # pixels, for a page
-FRAMES_PER_SECOND = 50  # of a film: one frame a decision, close to real time for most tasks
+FRAMES_PER_SECOND = 50  # of a film: one frame a decision, which is one to four times real time for DMC's tasks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,14 +88,15 @@ def main(config: EvaluateConfig) -> None:
 
     def film(step: TensorDictBase) -> None:
         nonlocal ended
-        if not ended:
+        ended = ended or bool(step["next", "done"].reshape(-1)[0])
+        if not ended:  # at its end the simulator stands at the start of another episode already
             frames.append(render_frame(_first(env), *size))
-            ended = bool(step["next", "done"].reshape(-1)[0])
 
     if config.video:
+        seed_everything(config.seed)
         env.reset()
-        # Fails here, before the episodes, if this machine cannot render or lacks what writes a film.
-        render_frame(_first(env), *size)
+        # The start. Fails here, before the episodes, if this machine cannot render or lacks what writes a film.
+        frames.append(render_frame(_first(env), *size))
         film_writer(config.video)
         env.set_seed(config.seed)  # the episodes are those that are played without a film
     seed_everything(config.seed)

@@ -24,7 +24,8 @@ __all__ = ["Inspection", "Job", "State", "Strip"]
 
 FRAME_SIZE = 160
 STRIP_FRAMES = 12
-_KEPT = 16  # traces, and episodes
+KEPT = 16
+"""Traces, and episodes, that are kept."""
 # What an observation leaves open (velocities that it lacks, contacts, the simulator's warm start) is not made up.
 _NO_SIMULATOR = (
     "There are no frames, and the plan is not rolled in the simulator: a row of the replay buffer holds what was "
@@ -54,6 +55,10 @@ class Strip(NamedTuple):
 class Job:
     """Work that may take a while."""
 
+    request: tuple[State, dict[str, Any], int] | None = None
+    """What is planned: state, changed settings, seed."""
+    like: int | None = None
+    """Number of the trace in whose components it is drawn."""
     what: str = "waiting"
     done: int = 0
     of: int = 0
@@ -150,7 +155,7 @@ class Inspection:
         """
         if self._job is not None:
             self._job.stop.set()
-        job = self._job = Job()
+        job = self._job = Job(request=(state, dict(changes), seed), like=like)
         job.future = self._worker.submit(self._make, job, state, dict(changes), like, seed)
         return job
 
@@ -315,5 +320,5 @@ def _sentence(error: Exception) -> str:
 
 def _keep(kept: OrderedDict[int, Any], key: int, value: Any) -> None:
     kept[key] = value
-    while len(kept) > _KEPT:
+    while len(kept) > KEPT:
         kept.popitem(last=False)

@@ -119,7 +119,7 @@ def reward_check(trace: Trace) -> Drawing:
 
 @figure_of
 def compare_plans(trace: Trace, other: Trace) -> Drawing:
-    """Difference of two traces' final means and chosen first actions, second less first, by action dimension."""
+    """Difference of two traces' final means, second less first, by action dimension."""
     steps = min(trace.horizon, other.horizon)
     gap = other["mean"][-1, :steps] - trace["mean"][-1, :steps]
     widest = max(float(np.abs(gap).max()), 1e-6)

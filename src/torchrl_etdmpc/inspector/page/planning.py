@@ -58,6 +58,8 @@ def connect_plans(app: Any, inspection: Inspection) -> None:
                 state = Chosen(int(episode), int(step), replay=source == "replay")
                 changes = changed_settings(inspection, names, values)
             except ValueError as error:
+                if number in jobs:
+                    jobs[number].stop.set()  # nobody will look at what it comes to
                 return no_update, no_update, True, "", "0", "hidden", "hidden", str(error)
             job = inspection.start(state, changes, like=held, seed=int(seed))
             number = max(jobs, default=0) + 1
@@ -75,7 +77,12 @@ def connect_plans(app: Any, inspection: Inspection) -> None:
         if job.future.cancelled() or job.future.exception() is not None:
             error = "" if job.future.cancelled() else " ".join(str(job.future.exception()).split())
             return no_update, number, True, "", "0", "hidden", "hidden", error
-        return job.future.result(), number, True, "", "1", "hidden", "hidden", ""
+        made = job.future.result()
+        if held in inspection.traces and held not in (job.like, made) and job.request is not None:
+            state, changes, seed = job.request  # another plan was held meanwhile: again, in its components
+            jobs[number] = inspection.start(state, changes, like=held, seed=seed)
+            return no_update, number, False, "planning", "0", "", "", ""
+        return made, number, True, "", "1", "hidden", "hidden", ""
 
     @app.callback(
         Output({"type": "setting", "name": ALL}, "value"),

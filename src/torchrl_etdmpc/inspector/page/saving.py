@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_etdmpc.inspector.inspection import Inspection
+from torchrl_etdmpc.inspector.inspection import KEPT, Inspection
 from torchrl_etdmpc.inspector.saved_page import write_page
 
 
@@ -21,8 +21,12 @@ def connect_saving(app: Any, inspection: Inspection) -> None:
         prevent_initial_call=True,
     )
     def save(_: Any, folder: str | None, one: Any, two: Any) -> str:
-        if one not in inspection.traces:
+        if one is None:
             return "There is nothing to save yet."
+        for number in (one, two):
+            if number is not None and number not in inspection.traces:
+                which = "This plan" if number == one else "The held plan"
+                return f"{which} is no longer kept, as the last {KEPT} are; plan it again."
         trace = inspection.traces[one]
         state = trace.manifest["state"]
         strip = inspection.strip(state["seed"]) if state["from"] == "episode" else None

@@ -73,6 +73,8 @@ OPTIONAL = {
     "frames": "SXYB",
 }
 _DIMENSIONS = REQUIRED | OPTIONAL
+_TOGETHER = {"points": ("explained", "basis", "centre"), "chosen_points": ("start_point",)}
+"""What is shown of an array needs these others."""
 
 
 class TraceError(RuntimeError):
@@ -148,6 +150,10 @@ class Trace:
                 raise TraceError(f"{name} of a trace must have shape {want}, got {list(array.shape)}.")
             if array.dtype.kind not in "biuf":
                 raise TraceError(f"{name} of a trace must hold numbers, got {array.dtype}.")
+        for name, needed in _TOGETHER.items():
+            lacking = [other for other in needed if name in self.arrays and other not in self.arrays]
+            if lacking:
+                raise TraceError(f"a trace with the array {name!r} needs {lacking[0]!r}, which is missing.")
         for name, least in (("elites", 0), ("chosen", -1)):
             array, most = self[name], sizes["N"] - 1
             if array.dtype.kind not in "iu" or array.size and not least <= array.min() <= array.max() <= most:
