@@ -133,10 +133,28 @@ def test_bmpc_plan_against_a_straightforward_one(measure, variant):
         measure("BMPC plan against a plain one", variant, call, rounds=10, baseline="eager per head")
 
 
-@pytest.mark.parametrize("variant", ["TorchRL MPPIPlanner", "eager", "compiled"])
+class ValueAtTheEnd(torch.nn.Module):
+    """What a planner needs of an estimator, of as many values as ours: discounted rewards and the value at the end."""
+
+    def __init__(self, world_model) -> None:
+        super().__init__()
+        self.values = world_model.values
+
+    def forward(self, imagined: TensorDict) -> TensorDict:
+        reward = imagined["next", "reward"]
+        discounts = 0.99 ** torch.arange(reward.shape[-2] + 1, device=reward.device)
+        value = self.values(imagined["next", "latent"][..., -1, :]).mean(-1)
+        score = (reward.squeeze(-1) * discounts[:-1]).sum(-1) + discounts[-1] * value
+        return imagined.set("advantage", score[..., None, None].expand_as(reward))
+
+
+@pytest.mark.parametrize("variant", ["TorchRL MPPIPlanner", "TorchRL MPPIPlanner, TD(1)", "eager", "compiled"])
 @pytest.mark.parametrize("name", ["bmpc", "cpu"])
 def test_plan_against_torchrl(measure, name, variant):
-    """One dynamics and one value head, the same candidates, horizon and iterations, no proposals."""
+    """One dynamics and one value head, the same candidates, horizon and iterations, no proposals.
+
+    TorchRL's estimator of TD(1) returns asks for the value of every step, although all but the last cancel.
+    """
     torch.manual_seed(0)
     config = configure(name, model={"num_dynamics": 1, "num_values": 1})
     world_model = build_agent(config, OBSERVATION_DIM, ACTION_DIM, DEVICE).world_model
@@ -148,9 +166,10 @@ def test_plan_against_torchrl(measure, name, variant):
     value = TensorDictModule(
         lambda z: world_model.values(z).mean(-1, keepdim=True), in_keys=["latent"], out_keys=["state_value"]
     )
+    every_step = TDLambdaEstimator(gamma=0.99, lmbda=1.0, value_network=value)
     theirs = MPPIPlanner(
         LatentEnv(world_model),
-        TDLambdaEstimator(gamma=0.99, lmbda=1.0, value_network=value),
+        every_step if variant.endswith("TD(1)") else ValueAtTheEnd(world_model),
         temperature=0.5,
         planning_horizon=budget["horizon"],
         optim_steps=budget["iterations"],
