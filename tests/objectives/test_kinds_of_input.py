@@ -233,6 +233,31 @@ def test_half_precision_leaves_the_discount_as_it_is():
         assert loss.to(dtype).discount.dtype == dtype
 
 
+@pytest.mark.parametrize("kind", ["efficient", "tdmpc2"])
+def test_a_loss_never_puts_the_targets_weights_into_the_world_model(kind):
+    """A planner in another thread, as behind TorchRL's AsyncBatchedCollector, would plan with them."""
+    sizes = {"latent_dim": 16, "mlp_dim": 16}
+    if kind == "efficient":
+        model = WorldModel(5, 3, **sizes)
+        loss = EfficientTDMPCLoss(model, discount=0.99)
+    else:
+        model = ActionValueWorldModel(5, 3, **sizes)
+        loss = TDMPC2Loss(model, discount=0.99)
+    SoftUpdate(loss, tau=0.01)
+    own, seen = [*model.value_head.parameters()], []
+    model.value_head.register_forward_pre_hook(lambda head, _: seen.append([*head.parameters()]))
+    before = loss(random_slices(5, 3))["value_target"]
+    for target, _ in loss.target_parameters()["value"]:
+        target.data.add_(torch.randn_like(target.data))
+    assert loss(random_slices(5, 3))["value_target"] != before  # they are used
+    if kind == "efficient":  # the policy of TD-MPC2's critic maximises values by constant copies of these weights
+        assert all(now is then for parameters in seen for now, then in zip(parameters, own, strict=True))
+    weights = {id(target) for target, _ in loss.target_parameters()["value"]}
+    assert not weights & {id(parameter) for parameters in seen for parameter in parameters}
+    addresses = {target.data_ptr() for target, _ in loss.target_parameters()["value"]}
+    assert not addresses & {parameter.data_ptr() for parameters in seen for parameter in parameters}
+
+
 def test_a_loss_without_targets_saves_the_statistics_of_a_model_that_was_cast_without_it():
     model = WorldModel(5, 3, latent_dim=16, mlp_dim=16, normalize_observations=True)
     loss = EfficientTDMPCModelLoss(model)

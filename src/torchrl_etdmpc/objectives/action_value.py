@@ -162,7 +162,7 @@ def _action_value(
     assert slices.reward is not None
 
     def values(latent: Tensor, action: Tensor) -> Tensor:
-        logits = functional_call(loss.value, targets["value"], (latent, action))
+        logits = functional_call(loss._target_value, targets["value"], (latent, action))
         return two_hot_decode(logits, world_model.bins).movedim(0, -1)
 
     target = action_value_target(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -162,6 +163,7 @@ class LatentRolloutLoss(LossModule):
     q_scale: Tensor
     scale_tau: float
     kl_direction: KLDirection
+    _target_value: nn.Module | None
     _trained: dict[str, tuple[Tensor | None, set[int]]]
     """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
 
@@ -202,6 +204,9 @@ class LatentRolloutLoss(LossModule):
         for name, attribute in self._attributes.items():
             if name in trained and getattr(world_model, attribute) is not None:
                 self.convert_to_functional(getattr(world_model, attribute), name, create_target_params=name in followed)
+        # A module that is called with the targets' weights holds them while it runs, and a planner in another thread
+        # would read them: target values are computed by a copy that has no weights.
+        vars(self)["_target_value"] = copy.deepcopy(world_model.value_head).to("meta") if "value" in followed else None
         device = world_model.version.device
         self._scalars: frozenset[str] = frozenset()
         for term in self.terms:

@@ -274,7 +274,7 @@ def _value(
     targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
 
     def values(latent: Tensor) -> Tensor:
-        logits = functional_call(loss.value, targets["value"], (latent,))
+        logits = functional_call(loss._target_value, targets["value"], (latent,))
         return two_hot_decode(logits, world_model.bins).movedim(0, -1)
 
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
