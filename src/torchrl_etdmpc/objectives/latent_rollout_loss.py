@@ -163,7 +163,7 @@ class LatentRolloutLoss(LossModule):
     q_scale: Tensor
     scale_tau: float
     kl_direction: KLDirection
-    _target_value: nn.Module | None
+    _target_value: Any
     _trained: dict[str, tuple[Tensor | None, set[int]]]
     """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
 
@@ -282,8 +282,8 @@ class LatentRolloutLoss(LossModule):
 
     def _holds_other_buffers(self, name: str) -> bool:
         """Whether a network has got other buffers since they were read, as by a cast of the world model alone."""
-        held = self._modules[f"{name}_params"].values(True, True)  # pyright: ignore[reportOptionalMemberAccess]
-        known = {value.data_ptr() for value in held if not isinstance(value, nn.Parameter)}
+        held: Any = self._modules[f"{name}_params"]
+        known = {value.data_ptr() for value in held.values(True, True) if not isinstance(value, nn.Parameter)}
         return known != {buffer.data_ptr() for buffer in self.__dict__[name].buffers()}
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
