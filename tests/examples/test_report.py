@@ -752,10 +752,10 @@ def test_runs_are_not_called_like_a_column_of_the_tables(refused, name):
 
 
 def test_a_step_of_the_grid_that_was_given_is_taken(run_main):
-    rows = (f"{steps},{steps // 2},7,1.0,{steps // 10},0.5,10\n" for steps in range(0, 7_008, 1_002))
-    make_run("runs/a", text=HEADER + "".join(rows))
-    run_main("runs", "--budget", "7014", "--grid-step", "1002", "--out", "out")
-    assert "every 1,002 env steps" in Path("out", "index.md").read_text()
+    rows = (f"{steps},{steps},7,1.0,{steps // 10},0.5,10\n" for steps in range(0, 7_008, 1_001))
+    make_run("runs/a", task="gym/Pendulum-v1", text=HEADER + "".join(rows))
+    run_main("runs", "--budget", "7007", "--grid-step", "1001", "--out", "out")  # 10, 5, 4, 3, 2 do not divide it
+    assert "every 1,001 env steps" in Path("out", "index.md").read_text()
 
 
 def test_a_budget_without_a_grid_is_refused(refused):
