@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 import torch.distributed as dist
-from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 
 from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.modules.new_weights import draw_new_weights
 from torchrl_etdmpc.objectives.latent_rollout import counted_mean, latent_rollout
+from torchrl_etdmpc.objectives.shared_networks import SharedNetworksLoss
 from torchrl_etdmpc.objectives.slices import FIELDS, OBSERVATION_FIELDS, SliceReader, Slices
 from torchrl_etdmpc.objectives.terms import PRIORITY, KLDirection, Term, check_terms
-from torchrl_etdmpc.objectives.update_count import count_updates, restart_count
+from torchrl_etdmpc.objectives.update_count import count_updates
 
 Reduction = Literal["none", "mean", "sum"]
 """What a loss makes of the errors of its steps."""
@@ -51,7 +50,7 @@ def _reduced(term: Tensor, slices: Slices, reduction: Reduction) -> Tensor:
     return term.sum() if reduction == "sum" else term.transpose(0, 1)
 
 
-class LatentRolloutLoss(LossModule):
+class LatentRolloutLoss(SharedNetworksLoss):
     """A loss made of terms, which trains a :class:`~torchrl_etdmpc.modules.WorldModel` on replayed slices.
 
     What it trains, reads and returns follows from its terms. Every term is weighted once, by the coefficient buffer
@@ -135,46 +134,15 @@ class LatentRolloutLoss(LossModule):
     default_keys = _AcceptedKeys
     default_value_estimator = None  # pyright: ignore[reportAssignmentType]
 
-    world_model: WorldModel
     reduction: Reduction  # pyright: ignore[reportIncompatibleVariableOverride]
     rho: Tensor
-    # Each loss has what its networks and terms need of the following.
-    encoder: nn.Module
-    encoder_params: TensorDictParams
-    target_encoder_params: TensorDictParams
-    dynamics: nn.Module
-    dynamics_params: TensorDictParams
-    target_dynamics_params: TensorDictParams
-    reward: nn.Module
-    reward_params: TensorDictParams
-    target_reward_params: TensorDictParams
-    value: nn.Module
-    value_params: TensorDictParams
-    target_value_params: TensorDictParams
-    termination: nn.Module
-    termination_params: TensorDictParams
-    target_termination_params: TensorDictParams
-    policy: nn.Module
-    policy_params: TensorDictParams
-    target_policy_params: TensorDictParams
+    # Each loss has what its terms need of the following.
     discount: Tensor
     entropy_coef: Tensor
     kl_scale: Tensor
     q_scale: Tensor
     scale_tau: float
     kl_direction: KLDirection
-    _target_value: Any
-    _trained: dict[str, tuple[Tensor | None, set[int]]]
-    """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
-
-    _attributes: ClassVar[dict[str, str]] = {
-        "encoder": "encoder",
-        "dynamics": "dynamics",
-        "reward": "reward_head",
-        "value": "value_head",
-        "termination": "termination_head",
-        "policy": "policy",
-    }
 
     def __init__(
         self,
@@ -186,64 +154,31 @@ class LatentRolloutLoss(LossModule):
         ignore_termination: bool = True,
         reduction: Reduction | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(world_model)
         self._in_keys = None
         self._out_keys = None
         self.reduction = "mean" if reduction is None else reduction
         _check_reduction(self.reduction)
         if not 0 < rho <= 1:
             raise ValueError(f"rho must be in (0, 1], got {rho}.")
-        vars(self)["world_model"] = world_model
         self.ignore_termination = ignore_termination
         self.terms = (*terms, *extra_terms)
         reserved = {"rho", "scale_tau", "kl_direction", *vars(self), *dir(type(self))}
         check_terms(terms, extra_terms, networks=self._attributes, reserved=reserved)
-        self._trained = {}
         trained = {name for term in self.terms for name in term.networks}
-        followed = {name for term in self.terms for name in term.targets}
-        for name, attribute in self._attributes.items():
-            if name in trained and getattr(world_model, attribute) is not None:
-                self.convert_to_functional(getattr(world_model, attribute), name, create_target_params=name in followed)
-        # A module that is called with the targets' weights holds them while it runs, and a planner in another thread
-        # would read them: target values are computed by a copy that has no weights.
-        vars(self)["_target_value"] = copy.deepcopy(world_model.value_head).to("meta") if "value" in followed else None
+        self._share_networks(trained, {name for term in self.terms for name in term.targets})
         device = world_model.version.device
-        self._scalars: frozenset[str] = frozenset()
         for term in self.terms:
             numbers = {f"{term.name}_coef": term.coef, **term.scalars}
             for name, number in numbers.items():
                 if not math.isfinite(number):
                     raise ValueError(f"{name} must be finite, got {number}.")
                 self.register_coeff_buffer(name, float(number), device=device)
-            self._scalars |= numbers.keys()
             if isinstance(term.function, nn.Module):
                 self.add_module(term.name, term.function)
         self.register_buffer("rho", torch.tensor(float(rho), device=device))
         self.distill = True
         count_updates(world_model, self.parameters())
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # TorchRL has a list of such buffers for a class; here each loss has those of its terms.
-        scalars = (*vars(self).get("_scalars", ()), "rho")
-        number = isinstance(value, int | float) or (isinstance(value, Tensor) and value.ndim == 0)
-        if number and name in scalars and name in self._buffers:
-            self.get_buffer(name).fill_(value)  # a tensor's value as well: the buffer stays where it is
-        else:
-            super().__setattr__(name, value)  # pyright: ignore[reportArgumentType]  # TorchRL's annotation is too narrow
-
-    def _apply(self, fn, *args, **kwargs):
-        # The world model is not a submodule (its parameters are already here), but its buffers must follow a cast.
-        names = (*self._scalars, "rho", *(name for name in _RUNNING_SCALES if name in self._buffers))
-        scalars = {name: self.get_buffer(name) for name in names}
-        super()._apply(fn, *args, **kwargs)
-        for name, exact in scalars.items():
-            now = self.get_buffer(name)
-            # In bfloat16 a discount of 0.99 is 0.988, and a scale of 10 that moves by a hundredth stays 10.
-            if now.element_size() < 4:
-                self.register_buffer(name, exact.to(now.device))
-        self.__dict__["world_model"]._apply(fn)
-        self._read_networks()  # a cast keeps parameters and replaces buffers
-        return self
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """There is none to choose: the value targets are the terms' own.
@@ -261,104 +196,6 @@ class LatentRolloutLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         self._in_keys = None  # a new name for a key changes what dispatch expects
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._trained = {}
-        # A copy or an unpickled loss gets the networks as one object graph (they stand in __dict__, where
-        # convert_to_functional put them), but tensordict clones its entries: the loss would train weights that nobody
-        # reads. The targets are nobody else's and stay as copied.
-        self._read_networks()
-        count_updates(self.world_model, self.parameters())
-
-    def _read_networks(self) -> None:
-        """Makes the entries of <name>_params the very parameters and buffers of the world model's networks again.
-
-        Planner, loss and updater rely on it.
-        """
-        for name in self._attributes:
-            if f"{name}_params" in self._modules:
-                self._modules[f"{name}_params"] = TensorDict.from_module(self.__dict__[name], as_module=True)
-
-    def _holds_other_buffers(self, name: str) -> bool:
-        """Whether a network has got other buffers since they were read, as by a cast of the world model alone."""
-        held: Any = self._modules[f"{name}_params"]
-        known = {value.data_ptr() for value in held.values(True, True) if not isinstance(value, nn.Parameter)}
-        return known != {buffer.data_ptr() for buffer in self.__dict__[name].buffers()}
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        self._refuse_other_weights()
-        if any(self._holds_other_buffers(name) for name in self._attributes if f"{name}_params" in self._modules):
-            self._read_networks()
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        # The world model is not a submodule, but who restores the weights restores the number of updates in them.
-        destination[f"{prefix}version"] = self.world_model.version.detach()
-
-    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._refuse_other_networks({k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)})
-        version = state_dict.get(f"{prefix}version")
-        super()._load_from_state_dict({k: v for k, v in state_dict.items() if k != f"{prefix}version"}, prefix, *args)
-        if version is not None:  # files of before do not have it
-            self.world_model.version.copy_(version)
-            restart_count(self.world_model)
-
-    def _refuse_other_networks(self, state: Mapping[str, Any]) -> None:
-        """Raises before anything is overwritten; a tensordict that does not fit says nothing of where."""
-        networks = {name for name in self._modules if name.endswith("_params")}
-        networks &= {name.partition(".")[0] for name in state}
-        own, given = (
-            {name: value for name, value in entries.items() if name.partition(".")[0] in networks}
-            for entries in (self.state_dict(), state)
-        )
-        faults = [
-            f"{name} is {list(given[name].shape)} there and {list(value.shape)} here"
-            if name in given
-            else f"it lacks {name}"
-            for name, value in own.items()
-            if name not in given or given[name].shape != value.shape
-        ]
-        faults += [f"it has {name}" for name in given if name not in own]
-        if faults:
-            more = f", and {len(faults) - 1} more" if faults[1:] else ""
-            raise RuntimeError(f"the state is of another world model: {faults[0]}{more}; build this one like that one.")
-
-    def reset_parameters_recursive(self) -> None:
-        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones.
-
-        Running scales begin anew.
-        """
-        for name in self._attributes:
-            if f"{name}_params" in self._modules:
-                draw_new_weights(self.__dict__[name])
-        for term in self.terms:
-            if isinstance(term.function, nn.Module):
-                draw_new_weights(term.function)
-        parameters: dict[str, Any] = self._modules
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                target.data.update_(parameters[name.removeprefix("target_")].data)
-        for name in _RUNNING_SCALES:
-            if name in self._buffers:
-                self.get_buffer(name).fill_(1)
-
-    def network_parameters(self) -> dict[str, list[nn.Parameter]]:
-        """Every parameter of this loss, once, by its network: of the world model, or of a term that brings its own."""
-        found: dict[str, list[nn.Parameter]] = {}
-        for name, parameter in self.named_parameters():  # lists a parameter that is shared once
-            found.setdefault(name.partition(".")[0].removesuffix("_params"), []).append(parameter)
-        return found
-
-    def target_parameters(self) -> dict[str, list[tuple[Tensor, nn.Parameter]]]:
-        """Each parameter of a target network and the trained one that it follows, by network."""
-        parameters: dict[str, Any] = self._modules
-        found: dict[str, list[tuple[Tensor, nn.Parameter]]] = {}
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                own = parameters[name.removeprefix("target_")]
-                pairs = [(target.get(key), own.get(key)) for key in target.keys(True, True)]
-                trained = [pair for pair in pairs if isinstance(pair[1], nn.Parameter) and pair[1].requires_grad]
-                found[name.removeprefix("target_").removesuffix("_params")] = trained
-        return found
 
     @property
     def distill(self) -> bool:
@@ -411,6 +248,19 @@ class LatentRolloutLoss(LossModule):
     def out_keys(self, keys: list[str]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._out_keys = keys
 
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones.
+
+        Running scales begin anew.
+        """
+        super().reset_parameters_recursive()
+        for term in self.terms:
+            if isinstance(term.function, nn.Module):
+                draw_new_weights(term.function)
+        for name in _RUNNING_SCALES:
+            if name in self._buffers:
+                self.get_buffer(name).fill_(1)
+
     def slices(self, tensordict: TensorDictBase) -> Slices:
         """The entries that this loss reads, time first.
 
@@ -438,36 +288,6 @@ class LatentRolloutLoss(LossModule):
             terminated_key=self._key("terminated") if refused else None,
         )
         return reader.read(tensordict, self._reads())
-
-    def _refuse_other_weights(self) -> None:
-        if torch.compiler.is_compiling():
-            return
-        for name, attribute in self._attributes.items():
-            held: Any = self._modules.get(f"{name}_params")
-            if held is None:
-                continue
-            # An encoder may begin with buffers, and have nothing else.
-            own = (value for value in held.values(True, True) if isinstance(value, nn.Parameter))
-            network, first = getattr(self.world_model, attribute), next(own, None)
-            now = next(network.parameters(), None)
-            if name not in self._trained or self._trained[name][0] is not first:
-                parameters = () if first is None else (first, *own)
-                self._trained[name] = first, {id(parameter) for parameter in parameters}
-            if now is not first or {id(parameter) for parameter in network.parameters()} != self._trained[name][1]:
-                raise RuntimeError(
-                    f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
-                    "assign=True), a new module or layer and to_module() of the loss put other parameters there; load "
-                    "without assign, build the loss and its optimizer afterwards, or swap those of the world model."
-                )
-            target: Any = self._modules.get(f"target_{name}_params")
-            if target is None or now is None:
-                continue
-            if (_first(target).dtype, _first(target).device) != (now.dtype, now.device):
-                raise RuntimeError(
-                    f"world_model.{attribute} is {now.dtype} on {now.device}, its targets are {_first(target).dtype} "
-                    f"on {_first(target).device}; move or cast the loss, which takes the world model along: "
-                    "loss.to(...)."
-                )
 
     def write_priority(self, tensordict: TensorDictBase, evaluated: dict[str, Tensor]) -> None:
         """Moves the priorities of a batch, if there are some, from what :meth:`evaluate` returned into the batch."""
@@ -508,24 +328,6 @@ class LatentRolloutLoss(LossModule):
         active = {name for term in self.active_terms for name in (term.name, *term.networks)}
         idle = {name for term in self.terms for name in (term.name, *term.networks)} - active
         return [p for name, own in self.network_parameters().items() if name in idle for p in own] if idle else []
-
-    def targets(self) -> dict[str, dict[str, Tensor]]:
-        """What the target networks are made of, by network and name: their parameters, and the network's own buffers.
-
-        ``SoftUpdate`` moves parameters alone, and a target whose statistics stay where they began is another network.
-        """
-        found: dict[str, dict[str, Tensor]] = {}
-        parameters: dict[str, Any] = self._modules
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                network = name.removeprefix("target_").removesuffix("_params")
-                entries = found[network] = {}
-                for key in target.keys(True, True):
-                    own = parameters[f"{network}_params"].get(key)
-                    trained = isinstance(own, nn.Parameter)
-                    entry = target.get(key).data if trained else own.detach().clone()  # it moves before it is read
-                    entries[key if isinstance(key, str) else ".".join(key)] = entry
-        return found
 
     def evaluate(
         self, slices: Slices, targets: Mapping[str, Mapping[str, Tensor]], reduction: Reduction = "mean"
@@ -570,7 +372,3 @@ class LatentRolloutLoss(LossModule):
         """Weights ``[T, B]`` errors by ``rho^k``."""
         powers = self.rho ** torch.arange(error.shape[0], device=error.device, dtype=error.dtype)
         return error * powers.unsqueeze(-1)
-
-
-def _first(params: Any) -> Tensor:
-    return next(iter(params.values(True, True)))
