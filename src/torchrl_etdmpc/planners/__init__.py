@@ -1,7 +1,8 @@
 """Planners, their objectives, and the imagined environment that they plan in."""
 
+from torchrl_etdmpc.planners.arguments import FirstAction, InitialPlan, ScoringDtype
 from torchrl_etdmpc.planners.bare_policy import BarePolicy
-from torchrl_etdmpc.planners.ensemble_mppi import EnsembleMPPIPlanner, FirstAction, InitialPlan, ScoringDtype
+from torchrl_etdmpc.planners.ensemble_mppi import EnsembleMPPIPlanner
 from torchrl_etdmpc.planners.export import export_planner, export_policy
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -44,19 +43,21 @@ from torchrl_etdmpc.keys import (
     VERSION,
 )
 from torchrl_etdmpc.modules.prediction import PredictionModel, has_action_values, has_policy
+from torchrl_etdmpc.planners.arguments import (
+    FirstAction,
+    InitialPlan,
+    ScoringDtype,
+    both_or_none,
+    check_budget,
+    check_choices,
+    check_fit,
+    floating_dtype,
+)
 from torchrl_etdmpc.planners.imagination import imagined_returns, policy_gaussian, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
 from torchrl_etdmpc.planners.primer import PlanPrimer
 from torchrl_etdmpc.planners.scores import Score, ScoreFunction, ScoreName, make_score
-
-FirstAction = Literal["elite", "mean", "best"]
-"""Whose first action is the mean of the target: an elite drawn by its weight, the fitted mean, or the best
-candidate."""
-InitialPlan = Literal["wide", "policy"]
-"""Where a search begins: around the carried plan or zeros with the largest deviation, or where the policy is."""
-ScoringDtype = Literal["float16", "bfloat16", "float32", "float64"]
-"""Names of the dtypes in which candidates can be scored."""
 
 
 class EnsembleMPPIPlanner(MPCPlannerBase):
@@ -172,18 +173,14 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 f"EnsembleMPPIPlanner needs a LatentEnv, got {type(env).__name__}; wrap the networks: "
                 "LatentEnv(world_model)."
             )
-        _check_budget(horizon, num_samples, num_elites, num_proposals, iterations, extra_iterations)
+        check_budget(horizon, num_samples, num_elites, num_proposals, iterations, extra_iterations)
         if num_proposals and not has_policy(env.world_model):
             raise ValueError(
                 f"num_proposals must be 0 for a model without a policy ({type(env.world_model).__name__}), got "
                 f"{num_proposals}."
             )
-        _check_fit(discount, inverse_temperature, std_min, std_max)
-        for name, choice in {"first_action": first_action, "eval_first_action": eval_first_action}.items():
-            if choice not in get_args(FirstAction):
-                raise ValueError(f"{name} must be one of {', '.join(get_args(FirstAction))}, got {choice!r}.")
-        if initial not in get_args(InitialPlan):
-            raise ValueError(f"initial must be one of {', '.join(get_args(InitialPlan))}, got {initial!r}.")
+        check_fit(discount, inverse_temperature, std_min, std_max)
+        check_choices(first_action, eval_first_action, initial)
         if initial == "policy" and not has_policy(env.world_model):
             raise ValueError(
                 f"initial must be 'wide' for a model without a policy ({type(env.world_model).__name__}), got 'policy'."
@@ -208,8 +205,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.eval_first_action = eval_first_action
         self.warm_start = warm_start
         self.initial: InitialPlan = initial
-        self.scoring_dtype = _floating_dtype(scoring_dtype)
-        self.proposal_log_std_bounds = _both_or_none(proposal_log_std_min, proposal_log_std_max)
+        self.scoring_dtype = floating_dtype(scoring_dtype)
+        self.proposal_log_std_bounds = both_or_none(proposal_log_std_min, proposal_log_std_max)
         self.compiled_plan: Callable[..., Plan] | None = None
         vars(self)["_imagination"] = _Imagination(env.world_model)
         self.observation_key, self.action_key = unravel_key(observation_key), unravel_key(action_key)
@@ -658,53 +655,3 @@ class _Imagination(nn.Module):
 
     def forward(self, latent: Tensor, actions: Tensor, **options: Any) -> Tensor:
         return imagined_returns(self.world_model, latent, actions, **options)
-
-
-def _check_budget(
-    horizon: int, num_samples: int, num_elites: int, num_proposals: int, iterations: int, extra_iterations: int
-) -> None:
-    for name, number in {"horizon": horizon, "iterations": iterations, "num_elites": num_elites}.items():
-        if number < 1:
-            raise ValueError(f"{name} must be at least 1, got {number}.")
-    if num_elites > num_samples:
-        raise ValueError(f"num_elites must be at most num_samples={num_samples}, got {num_elites}.")
-    if not 0 <= num_proposals < num_samples:
-        raise ValueError(f"num_proposals must be in [0, num_samples={num_samples}), got {num_proposals}.")
-    if extra_iterations < 0:
-        raise ValueError(f"extra_iterations must not be negative, got {extra_iterations}.")
-
-
-def _check_fit(discount: float, inverse_temperature: float, std_min: float, std_max: float) -> None:
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount must be in (0, 1], got {discount}.")
-    if not 0 <= inverse_temperature < math.inf:
-        raise ValueError(f"inverse_temperature must be finite and not negative, got {inverse_temperature}.")
-    if not 0 < std_max < math.inf:
-        raise ValueError(f"std_max must be finite and positive, got {std_max}.")
-    if not 0 < std_min <= std_max:
-        raise ValueError(f"std_min must be in (0, std_max={std_max}], got {std_min}.")
-
-
-def _floating_dtype(dtype: torch.dtype | str | None) -> torch.dtype | None:
-    if dtype is None:
-        return None
-    if isinstance(dtype, str):
-        if dtype not in get_args(ScoringDtype):
-            raise ValueError(f"scoring_dtype must be one of {', '.join(get_args(ScoringDtype))}, got {dtype!r}.")
-        return getattr(torch, dtype)
-    if not dtype.is_floating_point:
-        raise ValueError(f"scoring_dtype must be a floating point dtype, got {dtype}.")
-    return dtype
-
-
-def _both_or_none(low: float | None, high: float | None) -> tuple[float, float] | None:
-    if low is None and high is None:
-        return None
-    if low is None or high is None:
-        raise ValueError(
-            f"proposal_log_std_min and proposal_log_std_max must be given together, got {low} and {high}; leave both "
-            "out for the policy's own bounds."
-        )
-    if not -math.inf < low < high < math.inf:
-        raise ValueError(f"proposal_log_std_min must be below proposal_log_std_max={high} and both finite, got {low}.")
-    return low, high

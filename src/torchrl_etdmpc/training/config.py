@@ -20,7 +20,7 @@ from torchrl_etdmpc.collectors.step import Insertion
 from torchrl_etdmpc.envs import Task, get_task
 from torchrl_etdmpc.modules.normed_linear import Activation
 from torchrl_etdmpc.objectives.policy import KLDirection
-from torchrl_etdmpc.planners.ensemble_mppi import FirstAction, InitialPlan, ScoringDtype
+from torchrl_etdmpc.planners import FirstAction, InitialPlan, ScoringDtype
 from torchrl_etdmpc.planners.scores import ScoreName
 from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
