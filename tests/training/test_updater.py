@@ -367,6 +367,22 @@ def test_the_returned_numbers_are_detached_finite_scalars():
         assert value.isfinite(), name
 
 
+def test_the_loss_decides_whether_errors_are_averaged_or_summed():
+    batch, world_model, metrics = make_batch(), make_world_model(), []
+    for reduction in ("mean", "sum"):
+        updater = make_updater(copy.deepcopy(world_model), reduction=reduction)
+        torch.manual_seed(1)  # dropout
+        metrics.append(updater.step(batch.clone()))
+    mean, total = metrics
+    for name in ("loss_reward", "loss_value", "loss_policy", "grad_norm_model", "grad_norm_policy"):
+        torch.testing.assert_close(total[name], batch.numel() * mean[name])
+
+
+def test_a_loss_that_reduces_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"^the loss must reduce its terms to scalars, got reduction='none'; take"):
+        make_updater(reduction="none")
+
+
 @pytest.mark.parametrize(
     ("huge", "clipped"),
     [

@@ -58,7 +58,8 @@ class Updater:
             weights, or that world model itself.
 
     Raises:
-        ValueError: if an argument is out of range, parameters differ in dtype or device, or there is none to train.
+        ValueError: if an argument is out of range, the loss reduces nothing, parameters differ in dtype or device, or
+            there is none to train.
 
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> from torchrl_etdmpc.objectives import EfficientTDMPCLoss
@@ -91,6 +92,8 @@ class Updater:
             raise ValueError(f"tau must be in [0, 1], got {tau}.")
         if not 0 <= average_decay < 1:
             raise ValueError(f"average_decay must be in [0, 1), got {average_decay}.")
+        if loss.reduction == "none":
+            raise ValueError("the loss must reduce its terms to scalars, got reduction='none'; take 'mean' or 'sum'.")
         self.loss = loss
         self.grad_clip_norm = grad_clip_norm
         self.tau = tau
@@ -238,7 +241,7 @@ class Updater:
         # Departure from BMPC and TD-MPC2, which make two backward passes, the model's and then the policy's: neither
         # loss sends a gradient into what the other one trains, so the gradient of the sum is both. (A policy that
         # maximises action values does it with those of before the model's step, in TD-MPC2 with those of after it.)
-        out = self.loss.evaluate(slices, targets)
+        out = self.loss.evaluate(slices, targets, self.loss.reduction)
         total: Any = sum(value for key, value in out.items() if key.startswith("loss_"))
         metrics = {key: value.detach() for key, value in out.items()}
         clipped = {name: parts for name, parts in self._clipped.items() if parts}
