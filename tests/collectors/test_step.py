@@ -941,3 +941,28 @@ def test_that_a_plan_fell_back_is_in_the_step_and_not_in_the_buffer(lengths):
     assert collector.step()["plan", "fallback"].all()
     assert ("plan", "fallback") not in replay.storage[:].keys(True, True)
     assert ("plan", "loc") in replay.storage[:].keys(True, True)
+
+
+def test_an_episode_that_terminated_is_not_called_truncated_by_a_fault_behind_it():
+    replay = make_replay()
+    policy = RandomActions(answer=lambda call, action: torch.ones_like(action))
+    collector = StepCollector(LineEnv(border=0.5, broken="reward", broken_at=2), policy, replay_buffer=replay)
+    collector.step()
+    with pytest.raises(NonFiniteError):
+        collector.step()
+    (row,) = replay.storage[:]
+    assert [row["next", name].item() for name in ("done", "terminated", "truncated")] == [True, True, False]
+
+
+@pytest.mark.parametrize("insertion", ["step", "episode"])
+def test_a_last_step_that_is_not_finite_is_not_stored_where_the_reset_behind_it_fails(insertion):
+    replay = make_replay()
+    env = FailingReset(3, broken="reward", broken_at=3)
+    collector = StepCollector(env, RandomActions(), replay_buffer=replay, insertion=insertion)
+    for _ in range(2):
+        collector.step()
+    with pytest.raises(SimulatorError):
+        collector.step()
+    rows = replay.storage[:]
+    assert rows["next", "reward"].isfinite().all()
+    assert rows["next", "truncated"].flatten().tolist() == [False, True]

@@ -346,3 +346,12 @@ def test_half_precision_gives_what_single_precision_does():
     assert value.dtype == weights.dtype == torch.float16
     for got, expected in zip((value, weights), adaptive_mixture(mean.float(), std.float(), 1.0), strict=True):
         torch.testing.assert_close(got, expected.half())
+
+
+def test_a_depth_that_is_beta_deviations_ahead_of_a_certain_one_is_worth_as_much():
+    # Where the two are all but equal, the discriminant of the quadratic is zero, which rounding may take below it.
+    std, beta = torch.linspace(0.1, 3, 10_000), 10.0
+    mean = torch.stack([torch.zeros_like(std), beta * std], -1)
+    value, weights = adaptive_mixture(mean, torch.stack([torch.full_like(std, 1e-4), std], -1), beta)
+    torch.testing.assert_close(value, torch.zeros_like(std), atol=1e-3, rtol=0)
+    torch.testing.assert_close(weights.sum(-1), torch.ones_like(std))

@@ -61,3 +61,10 @@ def test_rows_that_do_not_count_are_as_if_they_were_not_there():
     torch.testing.assert_close(updated_moments(mean, variance, rows, 0.25, counts), expected)
     moved = updated_moments(mean, variance, rows, 0.25, torch.zeros_like(counts))
     assert torch.equal(moved[0], mean) and torch.equal(moved[1], variance)
+
+
+def test_rows_in_half_precision_are_counted_in_that_of_the_moments():
+    rows = torch.tensor([[-1000.0], [1000.0]], dtype=torch.float16)  # the square of which it does not hold
+    mean, variance = updated_moments(torch.zeros(1), torch.ones(1), rows, 1.0)
+    assert (mean.item(), variance.item()) == (0, 1_000_000)
+    assert mean.dtype == variance.dtype == torch.float32

@@ -121,3 +121,9 @@ def test_the_ranks_of_half_precision_are_those_of_single_precision(dtype):
 
 def test_an_empty_batch_leaves_it_where_it_is():
     assert updated_scale(torch.tensor(3.0), torch.zeros(0), tau=0.5).item() == 3
+
+
+@pytest.mark.parametrize("counts", [None, torch.tensor([False, True, False])])
+def test_one_value_has_no_spread(counts):
+    batch = torch.tensor([5.0]) if counts is None else torch.tensor([-90.0, 5.0, 90.0])
+    assert updated_scale(torch.tensor(3.0), batch, 0.5, counts).item() == 2

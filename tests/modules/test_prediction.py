@@ -58,6 +58,16 @@ def test_a_model_of_action_values_needs_their_number():
     require_prediction_model(model)
 
 
+def test_a_model_of_action_values_needs_a_policy(monkeypatch):
+    for name in ("policy", "act"):
+        monkeypatch.delattr(Pendulum, name)
+    model = Pendulum()
+    require_prediction_model(model)
+    model.action_values, model.num_values = (lambda latent, action: latent), 2
+    with pytest.raises(TypeError, match="^world_model must have .*, got Pendulum without policy, act; see "):
+        require_prediction_model(model)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_model_of_ones_own_is_planned_over_in_the_dtype_of_its_input(dtype):
     planner = EnsembleMPPIPlanner(LatentEnv(Pendulum(), dtype=dtype), score="final", warm_start=False)

@@ -178,5 +178,11 @@ def test_observations_of_another_dtype_say_how_to_cast_them(build):
     ):
         model.encode(observation)
     assert model.double().encode(observation).dtype == torch.float64
+
+
+def test_autocast_takes_observations_in_half_precision(build):
+    model = build()
+    observation = torch.randn(4, model.observation_dim).bfloat16()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert model.float().encode(observation.float()).shape == (4, model.latent_dim)
+        latent = model.encode(observation)
+    torch.testing.assert_close(latent.float(), model.encode(observation.float()), rtol=0, atol=0.02)

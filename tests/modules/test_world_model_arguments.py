@@ -106,3 +106,9 @@ def test_an_observation_of_another_size_is_named():
         ValueError, match=r"^observations must be of shape \[\.\.\., 3\], got \[5, 4\]; build the world"
     ):
         model.encode(torch.zeros(5, 4))
+
+
+def test_a_batch_norm_without_running_statistics_is_the_same_in_training_and_is_taken():
+    encoder = nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8, track_running_stats=False))
+    WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=encoder).train()
+    assert encoder[1].training

@@ -296,3 +296,11 @@ def test_drawing_new_weights_begins_the_running_scale_anew(make_loss):
     loss.kl_scale.fill_(50)
     loss.reset_parameters_recursive()
     assert loss.kl_scale == 1
+
+
+def test_a_plan_without_a_deviation_in_one_dimension_is_none(make_loss, slices):
+    slices["plan", "scale"][0, 0, 1] = 0
+    loss = make_loss("policy", reduction="none")(slices)["loss_policy"]
+    assert loss.isfinite().all()
+    assert loss[0, 0] == 0
+    assert (loss != 0).sum() == loss.numel() - 1

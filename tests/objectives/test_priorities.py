@@ -44,6 +44,12 @@ def test_equal_weights_change_nothing(loss, slices, run_seeded, assert_same_outp
     assert_same_output(run_seeded(loss, slices), expected)
 
 
+def test_the_weight_of_a_slice_is_that_of_the_row_that_was_drawn(loss, slices, run_seeded, assert_same_output):
+    expected = run_seeded(loss.eval(), weighted(slices))
+    slices["priority_weight"][:, 1:] = torch.rand(4, 2)  # of rows that came along
+    assert_same_output(run_seeded(loss, slices), expected, rtol=0, atol=0)
+
+
 def test_masks_and_weights_go_together(make_loss, kind, world_model, slices, run_seeded, terms_of):
     loss = make_loss(kind, world_model, reduction="none").eval()
     plain = run_seeded(loss, slices)

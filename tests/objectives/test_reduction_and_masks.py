@@ -246,3 +246,17 @@ def test_random_frames_of_torchrl_s_collector_leave_the_policy_finite(make_loss,
     assert all(parameter.grad.isfinite().all() for parameter in model.parameters() if parameter.grad is not None)
     assert model.policy.output.weight.grad.any()
     torch.testing.assert_close(out["policy_kl"], loss.eval()(planned_frames)["policy_kl"])
+
+
+def test_of_two_masks_a_step_needs_both(loss, slices, run_seeded, assert_same_output):
+    first, second = (torch.arange(3) < torch.tensor(lengths).unsqueeze(-1) for lengths in ([3, 1, 2, 3], [2, 3, 3, 0]))
+    slices["collector", "mask"], slices["shifted_valid"] = first, second
+    of_both = run_seeded(loss.eval(), slices)
+    slices["collector", "mask"] = slices["shifted_valid"] = first & second
+    assert_same_output(of_both, run_seeded(loss, slices), rtol=0, atol=0)
+
+
+def test_a_term_of_one_s_own_finds_a_scale_that_it_can_divide_by_in_padded_steps(make_loss, world_model, slices):
+    read = make_loss("whole", world_model).slices(_pad(slices, 0.0))
+    assert (read.plan_scale[~read.counts] == 1).all()
+    assert (read.action[~read.counts] == 0).all()

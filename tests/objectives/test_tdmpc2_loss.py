@@ -18,9 +18,11 @@ from torchrl_etdmpc.objectives import (
     EfficientTDMPCLoss,
     EfficientTDMPCValueLoss,
     TDMPC2Loss,
+    Term,
     action_value_target,
     policy_value,
 )
+from torchrl_etdmpc.testing import random_slices
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 
@@ -377,3 +379,16 @@ def test_a_critic_of_the_other_kind_is_refused(cls):
     for wrong in ({"discount": 0.0}, {"discount": 0.9, "scale_tau": 2.0}):
         with pytest.raises(ValueError, match=next(reversed(wrong))):
             TDMPC2Loss(make_model(), **wrong)
+
+
+def test_a_backward_pass_may_come_after_the_next_call():
+    loss = make_loss()
+    first = loss(random_slices(O, A))["loss_policy"]
+    loss(random_slices(O, A))
+    first.backward()  # fails if the second call has moved the scale in place
+
+
+def test_tdmpc2_takes_terms_of_one_s_own():
+    term = Term("mine", lambda model, slices, rollout: slices.action.square().mean(-1))
+    loss, batch = make_loss(extra_terms=[term]), random_slices(O, A)
+    torch.testing.assert_close(loss(batch)["mine_error"], batch["action"].square().mean())

@@ -50,6 +50,15 @@ def test_a_plan_stays_out_of_a_non_finite_region_even_if_the_optimum_lies_within
     assert (plan.mean >= -0.2).all()
 
 
+def test_the_value_of_a_mean_action_is_that_of_the_finite_candidates_alone(make_planner):
+    options = {"horizon": 1, "num_samples": 4, "num_elites": 3, "num_proposals": 0, "iterations": 1}
+    planner = make_planner(PatchyWorld(edge=-0.5), first_action="mean", **options)
+    noise = planner.draw_noise(1)
+    noise = noise._replace(candidates=torch.tensor([0.2, -0.8, -0.7, -0.9]).view(1, 1, 4, 1, 1) / 2.0)
+    plan = planner.plan(torch.zeros(1, 1), noise=noise, trace=True)
+    torch.testing.assert_close(plan.value, plan.trace.scores[:, 0, 0])
+
+
 def test_fewer_finite_candidates_than_elites_share_all_the_weight(make_planner):
     planner = make_planner(
         PatchyWorld(edge=-0.5), horizon=1, num_samples=4, num_elites=3, num_proposals=0, iterations=1, std_min=1e-3

@@ -594,3 +594,14 @@ def test_a_transform_that_would_change_what_was_planned_from_comes_first():
     with pytest.raises(RuntimeError, match="ObservationNorm changes 'observation' after reanalyze has planned from it"):
         late.sample()
     assert (content(late) == before).all()
+
+
+def test_stale_rows_add_up_over_samples():
+    buffer = make_buffer(40, capacity=40, num_slices=4)
+    reanalyze = make_reanalyze(buffer, num_slices=4)
+    reanalyze.enabled = False
+    for turn in range(1, 4):
+        sample = buffer.sample()
+        buffer.extend(rows(40, first=40 * turn))
+        reanalyze.refresh(sample)
+        assert (reanalyze.refreshed, reanalyze.stale) == (0, turn * len(sample))

@@ -712,6 +712,14 @@ def test_skipped_updates_are_counted_on_from_a_saved_state():
         restored.step(batch)
 
 
+def test_a_saved_state_does_not_go_on_counting():
+    updater, batch = make_updater(), make_batch()
+    state = updater.state_dict()
+    batch["next", "reward"][0] = torch.nan
+    updater.step(batch)
+    assert (int(state["skipped"]), int(state["skipped_in_a_row"])) == (0, 0)
+
+
 def test_a_policy_gradient_that_is_not_finite_stops_the_policy_alone():
     world_model, batch = make_world_model(), make_batch()
     updater, usual = make_updater(world_model), make_updater(copy.deepcopy(world_model))
@@ -750,3 +758,15 @@ def test_an_option_out_of_range_is_refused(option, message):
     with pytest.raises(ValueError) as caught:
         Updater(loss, **option)
     assert str(caught.value) == message
+
+
+def test_warming_up_leaves_weights_scale_statistics_and_distillation_as_they_are(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.training.updater.compile_call", lambda function, mode, keep: function)
+    loss = EfficientTDMPCLoss(make_world_model(normalize_observations=True), discount=0.9, ignore_termination=True)
+    updater = Updater(loss, compile_mode="default")
+    loss.distill = False
+    before = snapshot(updater)
+    updater.warm_up(make_batch())
+    assert not loss.distill
+    for name, value in snapshot(updater).items():
+        assert torch.equal(value, before[name]), name
