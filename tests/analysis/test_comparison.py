@@ -56,6 +56,12 @@ def cell(table: pd.DataFrame, method: str, task: str) -> pd.Series:
     return pd.Series(row)
 
 
+def ending(method: str, last: int, step: int) -> pd.DataFrame:
+    """Two seeds of return 900 up to ``last``; a third one of return 0, which ends with its third evaluation."""
+    going_on = seed_curves(method, lambda *_: 900.0, seeds=(1, 2), steps=range(step, last + 1, step))
+    return pd.concat([going_on, seed_curves(method, lambda *_: 0.0, seeds=(3,), steps=range(step, 3 * step + 1, step))])
+
+
 def numbers(comparison: Comparison) -> list[pd.DataFrame]:
     return [
         t.set_index(["task", "method"]).sort_index().sort_index(axis=1) for t in (comparison.areas, comparison.finals)
@@ -166,14 +172,7 @@ def test_seeds_with_other_checkpoints_than_each_other_have_their_own_areas():
 
 
 def test_after_a_seed_has_ended_values_are_those_of_the_others_alone():
-    ends = {1: 105_000, 2: 105_000, 3: 45_000}
-    rows = [
-        ("ours", "walker-walk", seed, step, 900.0 if seed < 3 else 0.0)
-        for seed, end in ends.items()
-        for step in range(15_000, end + 1, 15_000)
-    ]
-    runs = pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])
-    options = {"benchmark": get_benchmark("dmc-easy"), "tasks": ("walker-walk",)}
+    runs, options = ending("ours", 105_000, 15_000), {"benchmark": EASY, "tasks": TASKS[:1]}
     # At 50,000 nobody was evaluated; a line from 45,000 to 60,000 would mix the means of three seeds and of two.
     found = compare(runs, seed_estimates(runs.head(0)), budget=50_000, grid_step=5_000, **options)
     final = found.finals[found.finals["task"] == "walker-walk"].iloc[0]
@@ -184,9 +183,41 @@ def test_after_a_seed_has_ended_values_are_those_of_the_others_alone():
     assert set(returns["kind"]) == {"interpolated"}
 
 
+def test_wherever_a_curve_is_read_a_seed_that_has_ended_does_not_count():
+    """All were evaluated at 45,000 and the others again at 60,000; between them a line would lead from 600 to 900."""
+    runs, walk = ending("ours", 105_000, 15_000), TASKS[0]
+    ends = means("BMPC", lambda task, step: FINAL[task] * step / 200_000, steps=(0, 200_000))
+    options = {"published": ends, "budget": 60_000, "grid_step": 20_000, "tasks": TASKS[:1]}
+    returns = run(runs, steps=(50_000,), **options).returns.set_index(["method", "task"])
+    assert returns.loc[("ours", walk), "mean"] == pytest.approx(900)
+    final = cell(run(runs, steps=(), **(options | {"budget": 50_000, "grid_step": 25_000})).finals, "ours", walk)
+    assert (final["mean"], final["standard_error"]) == (900, 0)
+    # 600 up to 40,000 and 900 from 50,000 on
+    area = cell(run(runs, steps=(), **(options | {"grid_step": 10_000})).areas, "ours", walk)["auc"]
+    assert area == pytest.approx(0.01 * (600 / 2 + 600 + 600 + 900 + 900 / 2) / 800)
+
+
+def test_a_seed_of_the_normaliser_that_has_ended_at_the_benchmark_s_budget_does_not_count():
+    runs = ending("BMPC", 240_000, 60_000)  # the third seed ends at 180,000
+    comparison = run(runs, NO_MEANS, budget=150_000, steps=())
+    assert comparison.constants.to_dict() == dict.fromkeys(TASKS, 900.0)
+
+
 def test_the_grid_starts_where_all_methods_have_begun():
     late = seed_curves("late", lambda *_: 1.0, steps=(60_000, 200_000))
     np.testing.assert_array_equal(run(pd.concat([OURS, late])).grid, [100_000, 150_000, 200_000])
+
+
+def test_a_method_that_begins_late_on_one_task_is_named_with_the_latest_beginning():
+    late = [seed_curves("late", ours, tasks=TASKS[:1]), seed_curves("late", ours, tasks=TASKS[1:], steps=STEPS[3:])]
+    note = "Not evaluated before their first evaluation after 0 env steps, on one task at least: late from 150,000."
+    assert note in run(pd.concat([OURS, *late])).notes
+
+
+def test_a_method_that_begins_at_the_budget_was_evaluated_by_it():
+    late = seed_curves("late", ours, steps=(200_000, 250_000))
+    comparison = run(pd.concat([OURS, late]), methods=("ours", "BMPC"))
+    assert not any("left out: late" in note for note in comparison.notes)
 
 
 def test_a_run_that_ends_early_is_unavailable_there_and_in_the_aggregate_and_a_note_says_so():
@@ -201,6 +232,12 @@ def test_a_run_that_ends_early_is_unavailable_there_and_in_the_aggregate_and_a_n
         }
     note = "short ends before 200,000 env steps on walker-run (last evaluation 150,000): unavailable there"
     assert any(text.startswith(note) for text in comparison.notes)
+
+
+def test_of_several_tasks_that_end_before_the_budget_the_first_end_is_named():
+    short = [seed_curves("short", ours, tasks=TASKS[n : n + 1], steps=STEPS[: 3 + n]) for n in range(2)]
+    note = "short ends before 200,000 env steps on walker-run, walker-walk (last evaluation 100,000)"
+    assert any(text.startswith(note) for text in run(pd.concat([OURS, *short])).notes)
 
 
 def test_a_task_without_a_curve_is_unavailable_in_the_aggregate_and_a_note_says_so():
@@ -227,6 +264,12 @@ def test_quoted_points_count_up_to_a_smaller_budget_and_variants_are_paired_ther
     assert differences[[*TASKS]].tolist() == pytest.approx([100_000] * 2)
 
 
+def test_differences_over_tasks_are_of_normalised_returns():
+    ahead = seed_curves("ahead", lambda seed, task, step: ours(seed, task, step) + FINAL[task])
+    paired = run(pd.concat([OURS, ahead]), base="ours", variants=["ahead"]).paired.set_index("task")
+    assert paired.loc[AGGREGATE, "difference"] == pytest.approx(1)
+
+
 def test_a_variant_without_a_pair_is_named():
     alone = seed_curves("alone", ours, seeds=(7, 8))
     comparison = run(pd.concat([OURS, alone]), base="ours", variants=["alone"])
@@ -240,6 +283,22 @@ def test_returns_at_the_budget_may_lie_on_the_line_from_the_untrained_agent_if_a
     for from_zero, mean in expected.items():
         comparison = run(pd.concat([OURS, late]), budget=100_000, start=0, from_zero=from_zero)
         assert cell(comparison.finals, "late", "walker-walk")["mean"] == pytest.approx(mean, nan_ok=True)
+
+
+def test_the_error_of_an_area_may_use_the_line_from_the_untrained_agent_if_asked_for():
+    late = seed_curves("late", lambda seed, task, step: seed * step, steps=(0, 100_000, 200_000))
+    for from_zero in (False, True):
+        comparison = run(pd.concat([OURS, late]), start=50_000, from_zero=from_zero)
+        row = cell(comparison.areas, "late", "walker-walk")
+        assert np.isfinite([row["auc"], row["standard_error"]]).tolist() == [from_zero, from_zero]
+
+
+def test_the_thesis_mean_is_over_the_seeds_that_were_evaluated_there():
+    other = seed_curves("ours", lambda *_: 0.0, seeds=(4,), steps=(0, 100_000, 200_000))
+    runs = pd.concat([seed_curves("ours", lambda *_: 400.0), other])
+    for from_zero, mean in ((False, 300), (True, 400)):  # of four at 150,000, of which one lies on a line; of three
+        returns = run(runs, steps=(150_000,), from_zero=from_zero).returns.set_index(["method", "task"])
+        assert returns.loc[("ours", "walker-walk"), "mean"] == mean
 
 
 def test_a_mean_of_which_a_seed_lies_between_two_evaluations_is_not_called_evaluated():
@@ -314,6 +373,14 @@ def test_one_seed_has_a_mean_and_no_interval_and_a_note_says_so():
         assert np.isnan(cell(comparison.finals, "ours", task)["standard_error"])
     expected = f"ours: one seed on {', '.join(sorted(TASKS))}; a mean of one run, no interval."
     assert expected in comparison.notes
+
+
+def test_one_task_with_an_interval_of_its_area_is_enough():
+    alone = seed_curves("part", ours, seeds=(1,), tasks=TASKS[:1])
+    comparison = run(pd.concat([OURS, alone, seed_curves("part", ours, tasks=TASKS[1:])]))
+    assert [note for note in comparison.notes if note.startswith("No interval")] == [
+        "No interval of the AUC for BMPC: it needs the curves of at least two seeds."
+    ]
 
 
 def test_a_return_that_is_not_a_number_is_left_out_and_counted():

@@ -15,7 +15,17 @@ pytest.importorskip("pandas")
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
-from torchrl_etdmpc.analysis import BENCHMARKS, estimate, find_runs, read_curves, read_points, read_run, read_runs  # noqa: E402
+from torchrl_etdmpc.analysis import (  # noqa: E402
+    BENCHMARKS,
+    estimate,
+    find_runs,
+    mixed_settings,
+    read_curves,
+    read_points,
+    read_run,
+    read_runs,
+)
+from torchrl_etdmpc.analysis.curves import Run  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
 
 REFERENCE = Path(__file__).resolve().parents[2] / "src" / "torchrl_etdmpc" / "analysis" / "reference"
@@ -159,6 +169,44 @@ def test_the_same_method_task_and_seed_twice_is_an_error(tmp_path, text):
         make_run(tmp_path / name, text, seed=3)
     with pytest.raises(ValueError, match=r"two runs of cpu on walker-walk with seed 3: .*a and .*b; leave one out"):
         read_runs([tmp_path])
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        *("total_env_steps", "eval_every", "eval_episodes", "eval_policy", "checkpoint_every", "checkpoint_minutes"),
+        *("checkpoint_keep", "log_every", "max_faults", "max_skipped", "overlap", "compile", "workers"),
+    ],
+)
+def test_what_says_nothing_of_how_a_run_learns_may_differ(tmp_path, setting):
+    for seed in (1, 2):
+        run = make_run(tmp_path / str(seed), HEADER + line(0, 1.0), seed=seed)
+        with (run / "config.yaml").open("a") as file:
+            file.write(f"{setting}: {seed}\n")
+    assert mixed_settings([Run.read(run) for run in find_runs([tmp_path])]) == []
+
+
+def test_what_a_summary_says_of_a_result_is_no_setting(tmp_path):
+    for seed in (1, 2):
+        run = make_run(tmp_path / str(seed), HEADER + line(0, 1.0))
+        (run / "config.yaml").unlink()
+        summary = {"task": "walker-walk", "preset": "cpu", "seed": seed, "final_return": 100.0 * seed}
+        (run / "summary.json").write_text(json.dumps(summary))
+    assert mixed_settings([Run.read(run) for run in find_runs([tmp_path])]) == []
+
+
+def test_a_first_run_whose_settings_are_not_known_hides_no_difference():
+    runs = [
+        Run(Path(name), "ours", "walker-walk", seed, True, pd.DataFrame(), settings=settings)
+        for seed, (name, settings) in enumerate([("a", {}), ("b", {"optim.lr": 1}), ("c", {"optim.lr": 2})])
+    ]
+    assert mixed_settings(runs) == ["ours has runs with different settings: optim.lr is 1 in b and 2 in c"]
+
+
+def test_a_run_on_a_task_of_one_s_own_is_read_without_its_code(tmp_path):
+    run = make_run(tmp_path / "run", HEADER + line(0, 1.0))
+    (run / "config.yaml").write_text('{task: "mine:make", preset: cpu, seed: 1, episode_length: 200}')
+    assert Run.read(run).changed == ("episode_length=200",)
 
 
 def test_steps_that_are_not_environment_steps_are_an_error(tmp_path):
@@ -309,6 +357,8 @@ def test_a_baseline_with_a_header_only_has_no_rows(tmp_path, header):
         (AS_MEANS + "a,walker-run,0,high,1,2\n", "column mean must hold numbers"),
         (AS_MEANS + "a,walker-run,0,3,low,2\n", "column standard_error must hold numbers"),
         (PER_SEED + "a,walker-run,1,0,high\n", "column return_mean must hold numbers"),
+        (PER_SEED + "a,walker-run,1,0,inf\n", "column return_mean must hold finite numbers"),
+        (PER_SEED + "a,walker-run,1,0,-inf\n", "column return_mean must hold finite numbers"),
         (AS_MEANS + "a,walker-run,,3,1,2\n", "every row needs env_steps"),
         (b"", "is not a CSV file with a header line"),
         (b"\n\n", "is not a CSV file with a header line"),

@@ -36,8 +36,8 @@ def test_the_interquartile_mean_of_equal_scores_is_that_score_without_spread(sco
 
 
 def test_the_interquartile_mean_pools_tasks_and_ignores_the_outer_quarters():
-    scores = {"x": [-1000.0, 1.0, 2.0, 3.0], "y": [4.0, 5.0, 6.0, 1000.0]}
-    assert interquartile_mean(scores, resamples=FEW).value == (2 + 3 + 4 + 5) / 4
+    scores = np.arange(20.0) ** 2  # of which any other share has another mean
+    assert interquartile_mean({"x": scores[:12], "y": scores[12:]}, resamples=FEW).value == scores[5:15].mean()
 
 
 @small
@@ -92,6 +92,13 @@ def test_the_intervals_contain_their_value_and_are_not_empty(seed):
     for interval in (interquartile_mean(draw(seed)), probability_of_improvement(draw(seed), draw(seed + 10))):
         assert interval.lower < interval.value < interval.upper
     assert 0 <= interval.lower < interval.upper <= 1
+
+
+def test_the_limits_are_percentiles_of_the_resamples_so_that_a_probability_stays_one():
+    ours, theirs = [1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 0.0, 0.0, 0.0, 4.5]
+    found = probability_of_improvement({"x": ours}, {"x": theirs})
+    assert 0.8 < found.value < 1
+    assert found.upper <= 1
 
 
 def test_more_runs_give_narrower_intervals():

@@ -62,6 +62,11 @@ def test_ranks_by_hand(row, best, second):
     assert [None if pd.isna(name) else name for name in ranks] == [best, second]
 
 
+def test_ties_go_to_the_first_column_however_many_there_are():
+    ranks = rank_methods(table_of([1.0] * 40, columns=[str(number) for number in range(40)]))
+    assert ranks.loc[AGGREGATE].tolist() == ["0", "1"]
+
+
 @pytest.mark.parametrize(
     "row, expected",
     [

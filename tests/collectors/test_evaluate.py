@@ -127,6 +127,16 @@ def test_only_the_first_episode_counts_where_episodes_end_at_different_times(pol
     assert returns.tolist() == [expected_return(2), expected_return(7), expected_return(3)]
 
 
+def test_an_episode_that_terminates_is_over_before_its_time_limit():
+    env = CountingEnv(3)
+
+    def look(step: TensorDictBase) -> None:
+        assert env.resets <= 2  # the second one makes the observation after the end
+
+    limited = TransformedEnv(env, StepCounter(max_steps=10))
+    assert evaluate(limited, ConstantPolicy(), episodes=1, on_step=look).lengths.tolist() == [3]
+
+
 def test_a_round_lasts_as_long_as_its_longest_episode():
     steps: list[Tensor] = []
     env = side_by_side(2, 5)

@@ -260,6 +260,12 @@ def test_a_run_that_fails_makes_the_command_fail(call, mine, monkeypatch):
     ]
 
 
+def test_runs_that_are_left_make_the_command_fail(call, mine, monkeypatch):
+    monkeypatch.setattr(suite, "run_locally", lambda queue, **places: True)
+    message, _ = call(f"experiment={mine()}", "runs_dir=here")
+    assert message == 1
+
+
 def test_a_suite_that_is_stopped_says_so_with_the_code_for_later(call, mine, monkeypatch):
     monkeypatch.setattr(suite, "run_locally", lambda queue, **places: False)
     message, out = call(f"experiment={mine()}", "runs_dir=here")

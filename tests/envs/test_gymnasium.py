@@ -202,6 +202,22 @@ def test_making_an_environment_prints_and_writes_nothing(capfd, tmp_path, monkey
 
 
 @needs_mujoco
+def test_making_an_environment_leaves_mujoco_s_warnings_to_whom_they_were():
+    mujoco = pytest.importorskip("mujoco")
+
+    def mine(message: str) -> None:
+        pass
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(mine)
+    try:
+        make_env("gym/Hopper-v5")
+        assert mujoco.get_mju_user_warning() is mine
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+@needs_mujoco
 @pytest.mark.parametrize("name", ["Walker2d-v5", "Hopper-v5", "InvertedPendulum-v5", "HalfCheetah-v5", "Ant-v5"])
 def test_the_usual_mujoco_tasks_work(name):
     env = make_env(f"gym/{name}", seed=0)

@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 
 from torchrl_etdmpc.envs import DMC_TASKS, EASY_DMC, HARD_DMC, Task, get_task, register_task
+from torchrl_etdmpc.envs.tasks import registered_maker
 
 
 def test_the_sets_have_the_sizes_of_the_benchmarks_and_do_not_overlap():
@@ -91,6 +92,13 @@ def test_registering_the_same_task_again_is_fine_and_another_one_is_an_error():
             register_task(*again)
     register_task(dataclasses.replace(task, episode_length=8), make, replace=True)
     assert get_task("registered-twice").episode_length == 8
+
+
+def test_a_task_that_replaces_another_has_its_own_maker_or_none():
+    task = Task("registered-anew", "mine", episode_length=7)
+    register_task(task, print)
+    register_task(task, replace=True)
+    assert registered_maker(task) is None
 
 
 def test_a_benchmark_task_cannot_be_registered_as_something_else():

@@ -177,6 +177,26 @@ def test_a_full_disk_is_one_clear_line_and_keeps_nobody_out(small_disk, leave_fr
     assert elsewhere(lambda: getattr(RunDirectory(directory.path), how)(config)) is None
 
 
+@pytest.fixture
+def nothing_is_written(monkeypatch):
+    def fail(*_) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("torchrl_etdmpc.runs.directory.write_whole", fail)
+
+
+def test_a_run_whose_configuration_cannot_be_written_leaves_no_folder(tmp_path, nothing_is_written):
+    with pytest.raises(OSError, match="cannot be written"):
+        RunDirectory(tmp_path / "runs" / "walker" / "seed1").begin(CONFIG)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_that_cannot_be_stored_lets_others_in(begun, nothing_is_written, elsewhere):
+    with pytest.raises(OSError, match="cannot be written"):
+        begun.write_config(CONFIG | {"seed": 2})
+    assert elsewhere(lambda: RunDirectory(begun.path).go_on()) is None
+
+
 def test_another_process_is_kept_out_until_the_run_is_closed(begun, elsewhere):
     def go_on() -> None:
         RunDirectory(begun.path).go_on()
@@ -219,7 +239,7 @@ def test_a_run_that_began_between_the_look_and_the_lock_is_not_overwritten(tmp_p
     with pytest.raises(FileExistsError, match="already holds a run"):
         directory.begin(CONFIG)
     assert directory.read_config()["seed"] == 2
-    assert elsewhere(lambda: directory.go_on()) is None  # and nobody is kept out
+    assert elsewhere(lambda: RunDirectory(directory.path).go_on()) is None  # and nobody is kept out
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
@@ -235,6 +255,19 @@ def test_a_process_that_was_killed_keeps_nobody_out(tmp_path, in_copy):
     directory.go_on()
     directory.close()
     assert [path.name for path in directory.path.iterdir()] == ["config.yaml"]
+
+
+def test_who_asks_whether_it_is_in_use_keeps_nobody_out(tmp_path, monkeypatch):
+    pytest.importorskip("fcntl")
+    directory = RunDirectory(tmp_path / "run")
+    directory.path.mkdir()
+    directory.lock.touch()
+    ask = "import fcntl, sys; lock = open(sys.argv[1], 'rb'); fcntl.lockf(lock, fcntl.LOCK_SH)"
+    command = [sys.executable, "-S", "-c", f"{ask}; print(flush=True); input()", str(directory.lock)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as asking:
+        asking.stdout.readline()
+        monkeypatch.setattr("torchrl_etdmpc.runs.directory.time.sleep", lambda _: asking.communicate(b"\n"))
+        directory.begin(CONFIG)
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="becomes another user")
@@ -320,6 +353,13 @@ def test_a_run_that_made_no_step_is_taken_over(tmp_path, files):
     assert {path.name for path in directory.path.iterdir()} == {"config.yaml", "notes.txt"}
 
 
+def test_a_new_run_is_another_one_for_wandb_than_the_leftover_before_it(begun):
+    begun.wandb_id.write_text("1234")
+    begun.close()
+    RunDirectory(begun.path).begin(CONFIG)
+    assert not begun.wandb_id.exists()
+
+
 @pytest.mark.parametrize(
     "files",
     [
@@ -360,8 +400,9 @@ def test_an_abandoned_run_leaves_what_it_did_not_make(begun):
     RunDirectory(begun.path).begin(CONFIG)
 
 
-OWN = ["config.yaml", "eval.csv", "train.csv", "curve.png", ".lock", "checkpoints", "checkpoints/replay", "tensorboard"]
-OWN += ["checkpoints/resume/000000000100/agent.pt", "checkpoints/last.pt", "wandb_id", "checkpoints/resume"]
+OWN = ["config.yaml", "eval.csv", "train.csv", "curve.png", ".lock", "wandb_id", "tensorboard", "tensorboard/events"]
+OWN += ["checkpoints", "checkpoints/replay", "checkpoints/resume", "checkpoints/last.pt"]
+OWN += ["checkpoints/resume/000000000100/agent.pt"]
 
 
 @pytest.mark.parametrize("kind", ["link", "link to nowhere", "pipe"])

@@ -22,6 +22,7 @@ from torchrl_etdmpc.runs.files import (
     read_whole,
     remove_partial_files,
     replacing,
+    require_readable,
     write_tensors,
     write_whole,
 )
@@ -244,6 +245,21 @@ def test_what_is_not_a_file_or_too_large_is_refused_before_it_is_read(tmp_path):
     assert read_whole(large, len(OLD)) == OLD
     with pytest.raises(DamagedFileError, match="has 4,000 bytes; at most 3,999 are read"):
         read_whole(large, len(OLD) - 1)
+
+
+def test_no_more_is_read_than_a_quarter_of_the_memory_whatever_a_file_says_of_itself(tmp_path, monkeypatch):
+    file = tmp_path / "large"
+    file.write_bytes(bytes(20))
+    monkeypatch.setattr(os, "sysconf", lambda name: 8)  # 8 pages of 8 bytes
+    for limit in (None, 100):
+        with pytest.raises(DamagedFileError, match="has 20 bytes; at most 16 are read"):
+            read_whole(file, limit)
+
+
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_the_entry_that_no_file_may_hold_is_named_also_within_a_list(kind):
+    with pytest.raises(TypeError, match=r"^the state\['parts'\]\[1\] is of type builtins.object"):
+        require_readable({"parts": kind([1, object()])}, "the state")
 
 
 def test_a_link_is_the_same_file_and_replaces_an_old_one(tmp_path):

@@ -160,6 +160,11 @@ def test_finish_writes_valid_json_with_null_for_what_is_not_finite(tmp_path, log
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "config.yaml", "eval.csv", "summary.json"]
 
 
+def test_versions_that_are_given_stay(log):
+    content = json.loads(log.finish({"seed": 1, "versions": {"python": "2.7"}}).read_text())
+    assert content["versions"] == {"python": "2.7"}
+
+
 def test_a_run_that_goes_on_forgets_the_rows_after_its_checkpoint(tmp_path, log):
     log.log_train({"a": 1.0}, **COUNTERS)
     log.log_eval(RESULTS, **COUNTERS)

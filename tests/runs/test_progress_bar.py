@@ -70,6 +70,17 @@ def test_a_file_gets_plain_lines_in_the_log_with_the_time_left(monkeypatch, caps
     assert sys.stderr.getvalue() == ""
 
 
+def test_a_phase_that_goes_on_counts_from_where_it_was_and_so_does_its_time_left(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with console(), progress_bar("learning", 1000, "env steps", initial=998) as bar:
+        now[0] = 60.0
+        bar.advance()
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line[8:] == " learning: 999 of 1000 env steps, 1 min left"
+
+
 def test_a_missing_tqdm_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
     with pytest.raises(ImportError, match=r"^progress_bar needs tqdm, .*; run `pip install tqdm`\.$"):

@@ -10,7 +10,7 @@ import torch
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
-from torchrl_etdmpc.runs import write_mp4  # noqa: E402
+from torchrl_etdmpc.runs import write_film, write_mp4  # noqa: E402
 
 # imageio-ffmpeg leaves its pipes to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -51,6 +51,19 @@ def test_an_odd_size_loses_its_last_row_and_column(tmp_path):
     meta, decoded = decode(write_mp4(ramp(3, 33, 51), tmp_path / "odd.mp4", fps=10))
     assert meta["size"] == (50, 32)
     assert len(decoded) == 3
+
+
+def test_a_gif_shows_some_of_the_frames_and_lasts_as_long_as_all(tmp_path):
+    Image = pytest.importorskip("PIL.Image")
+    frames = torch.zeros(12, 32, 48, 3, dtype=torch.uint8)
+    for number in range(12):
+        frames[number, :, 4 * number : 4 * number + 4] = 255  # a bar that moves
+    shown = []
+    with Image.open(write_film(frames, tmp_path / "a.gif", fps=50)) as film:
+        for place in range(film.n_frames):
+            film.seek(place)
+            shown.append((int(np.asarray(film.convert("RGB"))[0, :, 0].argmax()), film.info["duration"]))
+    assert shown == [(0, 80), (16, 80), (32, 80)]  # ms
 
 
 def test_an_existing_video_is_replaced(tmp_path):

@@ -54,6 +54,11 @@ def test_what_is_written_is_read_again(write, tmp_path):
     assert experiment.searches["tuned"].settings == {"loss.rho": 0.4}
 
 
+def test_a_base_that_is_not_named_is_the_first_variant_from_then_on(write, tmp_path):
+    write_experiment(read_experiment(write(base=None)), tmp_path / "experiment.yaml")
+    assert read_experiment(tmp_path / "experiment.yaml").base == "one"
+
+
 def test_numbers_may_be_written_as_they_are_in_json(write):
     file = write(
         "tasks: [walker-walk]\nseeds: 1\nbudget: 1e5\nvariants: {a: {optim.lr: 1e-3}, b: {optim.lr: 2.5E-4}}\n"

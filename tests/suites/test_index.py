@@ -59,6 +59,21 @@ def test_a_run_is_finished_only_at_the_budget_that_is_asked_for(runs, small, tmp
     assert read_progress(shorter).state == "finished"
 
 
+def test_a_finished_run_is_finished_though_its_tables_are_gone(runs, small):
+    small.write_finished(runs[0])
+    for name in ("train.csv", "eval.csv"):
+        (runs[0].path / name).unlink()
+    assert repr(read_progress(runs[0])) == repr(Progress("finished", 400, math.nan, 20.0))
+
+
+@pytest.mark.parametrize("newer", ["train.csv", "eval.csv"])
+def test_a_run_is_as_far_as_the_newer_of_its_tables(runs, small, newer):
+    small.write_tables(runs[0], 200)
+    with open(runs[0].path / newer, "a") as file:
+        file.write("240,120,0,6.0" + ",500.0,0,1" * (newer == "eval.csv") + "\n")
+    assert read_progress(runs[0]).env_steps == 240
+
+
 def test_a_run_that_any_process_has_is_running(runs, small, in_copy):
     small.write_tables(runs[0], 200)
     with open(runs[0].path / ".lock", "w") as lock:
@@ -140,6 +155,14 @@ def test_only_finished_runs_are_remembered_and_read_again_when_they_change(runs,
     assert runs[1].name in read_again()
     longer = small.experiment(seeds=(1, 2, 3, 4), budget=800).runs(tmp_path / "runs")
     assert known.read(longer)[0].state == "stopped"
+
+
+def test_a_run_whose_summary_was_removed_is_not_remembered_as_finished(runs, small, tmp_path):
+    small.write_finished(runs[0])
+    known = RunIndex(tmp_path / "index.sqlite")
+    assert known.read(runs)[0].state == "finished"
+    (runs[0].path / "summary.json").unlink()  # as by a longer budget
+    assert known.read(runs)[0].state == "stopped"
 
 
 def test_an_index_that_is_removed_or_damaged_is_made_again(runs, small, tmp_path, read_again):

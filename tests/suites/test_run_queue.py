@@ -52,6 +52,12 @@ def test_finished_and_pruned_runs_are_not_handed_out(queue_of, small, tmp_path):
     assert len(queue.runs) == 3
 
 
+def test_a_run_that_was_given_up_is_tried_again_by_the_next_suite(queue_of, small, tmp_path):
+    (run,) = small.experiment().runs(tmp_path)
+    note(run, "failed", "the simulator is gone")
+    assert queue_of().next() == run
+
+
 def test_a_run_that_fails_is_tried_so_often_and_given_up_with_its_reason(queue_of, said):
     queue = queue_of(retries=2)
     for _ in range(3):
@@ -174,3 +180,15 @@ def test_a_waiting_run_of_a_trial_that_ended_early_never_begins(queue_of, small,
     queue.to_be_stopped()
     assert queue.next().seed == 2
     assert queue.next() is None
+
+
+def test_a_run_whose_trial_ended_early_is_not_waited_for(queue_of):
+    trials = TwoTrials([])
+    queue = queue_of(trials=[trials])
+    run = queue.next()
+    trials.early = [run]
+    queue.to_be_stopped()
+    run.path.mkdir(parents=True)
+    log_file(run).write_text("error: run_dir=here is in use by another process; wait for it.\n")
+    queue.ended(run, 1)
+    assert read_progress(run).state == "pruned"

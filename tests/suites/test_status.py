@@ -44,6 +44,12 @@ def test_the_time_left_is_that_of_what_is_left(small, tmp_path):
     assert status_text(runs, progress, workers=2).endswith("about 1 h 30 min left with 2 at a time")
 
 
+def test_runs_that_are_running_share_the_time_left(small, tmp_path):
+    runs = small.experiment(seeds=(1, 2), budget=720_000).runs(tmp_path)
+    progress = [Progress("running", 360_000, 1.0, 50.0)] * 2
+    assert status_text(runs, progress).endswith("about 1 h 0 min left with 2 at a time")
+
+
 def test_without_a_measured_speed_the_time_left_is_not_known(small, tmp_path):
     runs = small.experiment().runs(tmp_path)
     text = status_text(runs, [Progress("waiting")])
@@ -54,6 +60,11 @@ def test_without_a_measured_speed_the_time_left_is_not_known(small, tmp_path):
 def test_when_all_is_done_nothing_is_left(small, tmp_path):
     runs = small.experiment().runs(tmp_path)
     assert status_text(runs, [Progress("finished", 400, 1.0, 2.0)]).endswith("\n\n1 runs: 1 finished")
+
+
+def test_a_run_that_was_ended_early_takes_no_time(small, tmp_path):
+    runs = small.experiment().runs(tmp_path)
+    assert status_text(runs, [Progress("pruned", 100, 3.0, 20.0)]).endswith("\n\n1 runs: 1 pruned")
 
 
 def test_a_run_beyond_the_budget_takes_no_time_from_the_others(small, tmp_path):

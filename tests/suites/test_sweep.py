@@ -203,6 +203,14 @@ def test_a_trial_below_the_median_of_five_ends_early(search, small, tmp_path):
     assert [run.name for run in sweep.runs()] == [run.name for run in good]
 
 
+def test_the_evaluation_at_the_end_ends_no_trial_early(search, small, tmp_path):
+    sweep = Sweep(search(trials=1), "tuned", tmp_path)
+    (run,) = sweep.propose()
+    small.write_tables(run, 400)  # its summary is still to be written
+    assert sweep.look() == []
+    assert sorted(study_of(tmp_path).trials[0].intermediate_values) == [100, 200, 300]
+
+
 def test_without_pruning_no_trial_ends_early(search, small, tmp_path):
     sweep = Sweep(search(trials=7, prune=False), "tuned", tmp_path)
     for returns in (500.0, 500.0, 500.0, 500.0, 500.0, 1.0):

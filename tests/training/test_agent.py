@@ -180,6 +180,14 @@ def test_an_agent_without_a_compiler_is_eager_and_warns_once(monkeypatch, compil
     assert compiled == []
 
 
+def test_decisions_of_the_random_phase_do_not_pay_for_a_compilation(monkeypatch, compiled, tiny_agent):
+    monkeypatch.setattr(shutil, "which", lambda name: "g++")
+    for decisions, pays in ((6_999, False), (7_000, True)):  # 6,000 of them with updates
+        compiled.clear()
+        tiny_agent(compile="auto", total_env_steps=2 * decisions, replay={"seed_decisions": 1_000})
+        assert bool(compiled) == pays
+
+
 def test_the_update_and_every_planner_are_compiled_and_nothing_else(compiled, tiny_agent):
     agent = tiny_agent(compile="default")
     owners = [function.__wrapped__.__self__ for function, _ in compiled]

@@ -27,6 +27,7 @@ OBSERVATION_DIM, ACTION_DIM = 5, 2
     [
         ({"total_env_steps": 20_000}, 10_000),
         ({"total_env_steps": 20_001}, 10_001),  # the last decision may pass the budget
+        ({"total_env_steps": 20_002, "num_envs": 4}, 10_004),  # and so may the last decisions of several environments
         ({"total_env_steps": 20_000, "replay": {"capacity": 3000}}, 3000),
         ({"total_env_steps": 4_000_000}, 1_000_000),
     ],

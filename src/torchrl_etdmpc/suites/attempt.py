@@ -94,7 +94,7 @@ def end(run: Run, code: int) -> tuple[End, str]:
         return "elsewhere", "another process trains it"
     if code == 0 and directory.finished:
         return "finished", ""
-    if code in (EXIT_CODE, 130) or code < 0 or code - 128 in set(signal.Signals):
+    if code == EXIT_CODE or code < 0 or code - 128 in set(signal.Signals):
         return "stopped", f"exit code {code}"
     return "failed", last.removeprefix("error: ") or f"exit code {code}"
 
