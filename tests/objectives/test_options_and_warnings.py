@@ -31,6 +31,15 @@ def test_the_entropy_coefficient_can_be_assigned_in_place_and_takes_effect(make_
     assert loss.entropy_coef is buffer
 
 
+@pytest.mark.parametrize("value", [3, 3.0, torch.tensor(3.0)])
+def test_a_running_scale_is_assigned_in_place_as_the_coefficients_are(make_loss, value):
+    loss = make_loss("whole")
+    buffer = loss.kl_scale
+    loss.kl_scale = value
+    assert loss.kl_scale is buffer
+    assert buffer.item() == 3
+
+
 def test_the_default_coefficients_are_the_papers(make_loss, world_model):
     loss = make_loss("whole", world_model)
     defaults = {"consistency": 20.0, "reward": 0.1, "value": 0.1, "termination": 1.0, "policy": 1.0, "entropy": 1e-4}
