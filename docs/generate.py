@@ -85,13 +85,24 @@ def api_page(room: str) -> str:
         elif inspect.isclass(thing) and issubclass(thing, BaseException):
             lines += [f".. autoexception:: {full}", "   :no-members:", ""]
         elif inspect.isclass(thing):
-            lines += [f".. autoclass:: {full}", "   :members:", ""]
+            lines += [f".. autoclass:: {full}", "   :members:", "", *_inherited(thing), ""]
         elif routine:
             lines += [f".. autofunction:: {full}", ""]
         else:
             about = textwrap.indent(data_doc(room, name), "   ")
             lines += [f".. py:data:: {name}", *_value(thing), "", about, ""]
     return "\n".join(lines) + "\n"
+
+
+def _inherited(thing: type) -> list[str]:
+    """Entries of methods that a class has from bases which are no public names and have no entry of their own."""
+    offered = {id(public(room, name)) for room in ROOMS for name in public_names(room)}
+    bases = thing.__mro__[1:]
+    hidden = [base.__module__.startswith("torchrl_etdmpc.") and id(base) not in offered for base in bases]
+    names = dict.fromkeys(name for base in bases[: hidden.index(False)] for name in vars(base))
+    names = [name for name in names if not name.startswith("_") and name not in vars(thing)]
+    names = [name for name in names if inspect.isfunction(getattr(thing, name)) and getattr(thing, name).__doc__]
+    return [f"   .. automethod:: {name}" for name in names]
 
 
 def _value(thing: object) -> list[str]:

@@ -48,6 +48,13 @@ def test_every_public_name_is_on_a_page_with_a_text(generate):
             assert re.search(rf"(\.|:: |``){name}\b", page), f"{room}.{name} is on no page"
 
 
+def test_what_a_public_class_has_from_a_base_that_is_none_is_on_its_page(generate):
+    entries = generate.api_page("objectives").split(".. autoclass:: torchrl_etdmpc.objectives.")
+    shown = {entry.split()[0]: set(re.findall(r"automethod:: (\w+)", entry)) for entry in entries[1:]}
+    assert {"targets", "network_parameters", "target_parameters"} == shown["LatentRolloutLoss"]
+    assert shown["EfficientTDMPCLoss"] == set()  # its base has an entry
+
+
 def test_every_public_name_has_an_example(generate):
     missing = {
         f"{room}.{name}"
