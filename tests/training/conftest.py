@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch.utils._pytree import tree_map_only
 from torchrl.envs import EnvBase, Transform
 
 from torchrl_etdmpc.envs import make_env
@@ -85,3 +87,94 @@ def read_table() -> Callable[[Path], list[dict[str, float]]]:
             return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
     return read
+
+
+_SMALL: dict[str, Any] = {
+    "task": "cartpole-swingup",
+    "total_env_steps": 140,
+    "eval_every": 60,
+    "eval_episodes": 2,
+    "checkpoint_every": 50,
+    "log_every": 20,
+    "replay": {"seed_decisions": 24, "seed_hold": 3.0},
+}
+
+
+@pytest.fixture(scope="session")
+def small_config() -> Callable[..., TrainConfig]:
+    """Makes a configuration of three episodes and a half; checkpoints, rows and evaluations at different steps."""
+
+    def make(**changes: Any) -> TrainConfig:
+        return _tiny_config(**_SMALL | changes | {"replay": _SMALL["replay"] | changes.get("replay", {})})
+
+    return make
+
+
+def _results(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
+    def rows(name: str) -> list[dict[str, str]]:
+        with (run_dir / name).open(newline="") as file:
+            return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in csv.DictReader(file)]
+
+    stored = run.learner.replay.storage[:]
+    summary = json.loads((run_dir / "summary.json").read_text())
+    return {
+        "train.csv": rows("train.csv"),
+        "eval.csv": rows("eval.csv"),
+        "summary": {key: summary[key] for key in ("env_steps", "final_return", "best_return")},
+        "weights": {name: value.tolist() for name, value in run.learner.agent.loss.state_dict().items()},
+        "updater": tree_map_only(torch.Tensor, torch.Tensor.tolist, run.learner.agent.updater.state_dict()),
+        "replay": {str(key): stored.get(key).tolist() for key in stored.keys(True, True)},
+        "generations": run.learner.replay.writer.generations_of(torch.arange(len(run.learner.replay))).tolist(),
+        "random": torch.rand(3).tolist(),
+    }
+
+
+@pytest.fixture(scope="session")
+def results() -> Callable[[TrainingRun, Path], dict[str, Any]]:
+    """Reads everything of a run that must not depend on interruptions, as comparable values."""
+    return _results
+
+
+@pytest.fixture(scope="session")
+def stop_at() -> Callable[[TrainingRun, Any, str, int], None]:
+    """Stops a run as if the signal came during the given call of a method."""
+
+    def stop(run: TrainingRun, owner: Any, method: str, call: int) -> None:
+        original, calls = getattr(owner, method), [0]
+
+        def watched(*args: Any, **kwargs: Any) -> Any:
+            calls[0] += 1
+            if calls[0] == call:
+                run.stop.requested = True
+            return original(*args, **kwargs)
+
+        setattr(owner, method, watched)
+
+    return stop
+
+
+@pytest.fixture(scope="session")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Callable[[TrainConfig], dict[str, Any]]:
+    """The results of a run without interruptions, one per configuration."""
+    known: dict[str, dict[str, Any]] = {}
+
+    def run(config: TrainConfig) -> dict[str, Any]:
+        key = str(config)
+        if key not in known:
+            run_dir = tmp_path_factory.mktemp("straight")
+            run = _make_run(config, run_dir)
+            run.run()
+            known[key] = _results(run, run_dir)
+        return known[key]
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory, small_config: Callable[..., TrainConfig]) -> Path:
+    """The directory of a run that came to its end; tests damage a copy."""
+    run_dir = tmp_path_factory.mktemp("finished")
+    run = _make_run(small_config(), run_dir)
+    run.run()
+    run.log.directory.close()
+    return run_dir

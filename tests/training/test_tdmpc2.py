@@ -31,7 +31,7 @@ needs_compiler = pytest.mark.skipif(
 
 
 @pytest.fixture
-def small_config(tiny_config):
+def tdmpc2_config(tiny_config):
     """Runs of 30 random decisions and 50 learned ones, in episodes of 20."""
 
     def make(**changes: Any) -> TrainConfig:
@@ -48,10 +48,10 @@ def small_config(tiny_config):
     return make
 
 
-def test_plans_that_no_term_reads_are_not_made_anew(small_config):
+def test_plans_that_no_term_reads_are_not_made_anew(tdmpc2_config):
     message = r"^reanalyze\.every must be 0 where no term of the loss reads a plan, got 10\.$"
     with pytest.raises(ValueError, match=message):
-        build_agent(small_config(reanalyze={"every": 10}), 5, 1)
+        build_agent(tdmpc2_config(reanalyze={"every": 10}), 5, 1)
 
 
 def outcome(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
@@ -66,8 +66,8 @@ def outcome(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
     return {"weights": weights, "updater": updater, "random": torch.rand(3).tolist(), **rows}
 
 
-def test_a_run_that_was_killed_goes_on_as_if_nothing_had_happened(tmp_path, small_config, make_run):
-    config = small_config()
+def test_a_run_that_was_killed_goes_on_as_if_nothing_had_happened(tmp_path, tdmpc2_config, make_run):
+    config = tdmpc2_config()
     straight = make_run(config, tmp_path / "straight")
     straight.run()
     expected = outcome(straight, tmp_path / "straight")
@@ -91,12 +91,12 @@ def test_a_run_that_was_killed_goes_on_as_if_nothing_had_happened(tmp_path, smal
     assert run.learner.agent.updater.updates == 7 + 2 * 50
 
 
-def test_the_preset_builds_the_critic_and_its_loss(small_config):
-    agent = build_agent(small_config(), 5, 1)
+def test_the_preset_builds_the_critic_and_its_loss(tdmpc2_config):
+    agent = build_agent(tdmpc2_config(), 5, 1)
     assert isinstance(agent.world_model, ActionValueWorldModel)
     assert isinstance(agent.loss, TDMPC2Loss)
     assert agent.planner.draw_noise(1).heads.shape == (1, 1, 5)
-    published = build_agent(small_config(loss={"squashed_entropy": False}), 5, 1)
+    published = build_agent(tdmpc2_config(loss={"squashed_entropy": False}), 5, 1)
     batch = random_slices(5, 1)
     entropies = []
     published.world_model.load_state_dict(agent.world_model.state_dict())
@@ -106,9 +106,9 @@ def test_the_preset_builds_the_critic_and_its_loss(small_config):
     assert entropies[0] < entropies[1]
 
 
-def test_pretraining_trains_the_policy_as_tdmpc2_does_and_only_then(small_config, make_run, tmp_path):
+def test_pretraining_trains_the_policy_as_tdmpc2_does_and_only_then(tdmpc2_config, make_run, tmp_path):
     for number, trained in enumerate((True, False)):
-        run = make_run(small_config(replay={"pretrain_policy": trained}), tmp_path / str(number))
+        run = make_run(tdmpc2_config(replay={"pretrain_policy": trained}), tmp_path / str(number))
         for _ in range(30):
             run.learner.step()
         before = run.learner.agent.world_model.policy.output.weight.clone()
@@ -120,8 +120,8 @@ def test_pretraining_trains_the_policy_as_tdmpc2_does_and_only_then(small_config
         run.log.directory.close()
 
 
-def test_an_agent_file_holds_the_critic(tmp_path, small_config):
-    config = small_config()
+def test_an_agent_file_holds_the_critic(tmp_path, tdmpc2_config):
+    config = tdmpc2_config()
     agent = build_agent(config, 5, 1)
     for _ in range(3):
         agent.updater.step(random_slices(5, 1))
@@ -138,8 +138,8 @@ def test_an_agent_file_holds_the_critic(tmp_path, small_config):
 
 @pytest.mark.slow  # compiles for a minute
 @needs_compiler
-def test_compiled_plans_and_updates_equal_eager_ones(small_config):
-    compiled, eager = (build_agent(small_config(compile=setting), 5, 1) for setting in ("default", "off"))
+def test_compiled_plans_and_updates_equal_eager_ones(tdmpc2_config):
+    compiled, eager = (build_agent(tdmpc2_config(compile=setting), 5, 1) for setting in ("default", "off"))
     for _ in range(3):
         eager.updater.step(random_slices(5, 1, num_slices=4))
     compiled.loss.load_state_dict(eager.loss.state_dict())

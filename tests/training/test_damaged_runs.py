@@ -1,0 +1,274 @@
+"""Checkpoints that are damaged or lost, and disks that take no more: what a run says, and how it goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("dm_control")
+
+from torchrl_etdmpc.checkpoints import CheckpointError  # noqa: E402
+from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
+from torchrl_etdmpc.training import (  # noqa: E402
+    RunInterrupted,
+    load_agent,
+    read_agent_file,
+)
+
+
+def rows_of_the_newest(checkpoints: Path) -> Path:
+    """A file of the buffer that only the newest checkpoint needs."""
+    before, after = (
+        json.loads((checkpoints / "resume" / f"{steps:012d}" / "manifest.json").read_text())["replay"]["rows"]
+        for steps in (100, 140)
+    )
+    return checkpoints / "replay" / next(entry["file"] for entry in after if entry not in before)
+
+
+@pytest.mark.parametrize("damaged", ["agent.pt", "collector.pt", "state.pt", "manifest.json", "replay"])
+def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(
+    tmp_path, finished, straight, damaged, small_config, make_run, results
+):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    checkpoints = run_dir / "checkpoints"
+    newest = checkpoints / "resume" / f"{140:012d}"
+    file = rows_of_the_newest(checkpoints) if damaged == "replay" else newest / damaged
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match=r"^going on from .*/000000000100, because "):
+        resumed = make_run(small_config(), run_dir, resume=True)
+    assert (resumed.env_steps, len(resumed.learner.replay)) == (100, 50)
+    (run_dir / "summary.json").unlink()
+    resumed.run()
+    assert results(resumed, run_dir) == straight(small_config())
+
+
+def test_without_any_checkpoint_the_error_says_so(tmp_path, small_config, make_run):
+    config = small_config()
+    directory = RunDirectory(tmp_path)
+    directory.begin(config.to_dict())
+    directory.close()
+    with pytest.raises(CheckpointError, match=r"^cannot resume: there is no checkpoint under .*checkpoints\.$"):
+        make_run(config, tmp_path, resume=True)
+
+
+def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(
+    tmp_path, finished, small_config, make_run
+):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    for file in run_dir.glob("checkpoints/resume/*/manifest.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 2}))
+    with pytest.raises(CheckpointError) as caught:
+        make_run(small_config(), run_dir, resume=True)
+    agents = [run_dir / "checkpoints" / name for name in ("last.pt", "best.pt")]
+    assert re.match(r"cannot resume: .*/000000000140 has checkpoint format 2; this version r", str(caught.value))
+    left = f" Start a new run; the agents of this one can still be evaluated: {agents[0]}, {agents[1]}."
+    assert str(caught.value).endswith(left)
+    _, _, counters = load_agent(agents[0])
+    assert counters["env_steps"] == 140
+    agents[0].write_bytes(agents[0].read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=rf"can still be evaluated: {agents[1]}\.$"):
+        make_run(small_config(), run_dir, resume=True)
+
+
+class Refusing:
+    """A part that cannot be saved while it is told so."""
+
+    refuses = False
+
+    def state_dict(self) -> dict[str, Any]:
+        if self.refuses:
+            raise OSError(28, "No space left on device")
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        pass
+
+
+def test_a_save_that_failed_half_way_leaves_nothing_out_of_the_next_one(tmp_path, small_config, make_run):
+    # The buffer is written first: the next save must write those rows again, for their files are gone.
+    run = make_run(small_config(), tmp_path)
+    part = Refusing()
+    run.parts["late"] = part
+    for save in (True, False, True):
+        for _ in range(8):
+            run.learner.step()
+        part.refuses = not save
+        if save:
+            assert run.checkpoints.save()
+        else:
+            with pytest.warns(UserWarning, match=r"no checkpoint at 32 env steps \(No space left on device\)"):
+                assert not run.checkpoints.save()
+    run.log.directory.close()
+    resumed = make_run(small_config(), tmp_path, resume=True)  # in which any warning is an error
+    assert resumed.env_steps == 48
+    expected, actual = (one.learner.replay[:] for one in (run, resumed))
+    assert (expected == actual).all()
+
+
+def fill(disk: Path) -> None:
+    with (disk / "ballast").open("wb", buffering=0) as file:
+        for size in (2**20, 2**12, 1):
+            try:
+                while True:
+                    file.write(os.urandom(size))
+            except OSError:
+                continue
+
+
+def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight, small_config, make_run, results):
+    config = small_config(checkpoint_every=30)
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    step, calls = run.learner.collector.act, [0]
+
+    def watched(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 40:
+            fill(small_disk)
+        if calls[0] == 65:
+            (small_disk / "ballast").unlink()
+        return step(*args)
+
+    run.learner.collector.act = watched
+    with pytest.warns(UserWarning) as warned:
+        run.run()
+    texts = [str(warning.message) for warning in warned]
+    for steps in (90, 120):
+        assert f"no checkpoint at {steps} env steps (No space left on device); training goes on." in texts
+    assert results(run, run_dir) == straight(config)
+    (run_dir / "summary.json").unlink()
+    assert make_run(config, run_dir, resume=True).env_steps == 140
+
+
+def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(
+    small_disk, straight, small_config, make_run, results
+):
+    config = small_config(checkpoint_every=30)
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    step, calls = run.learner.collector.act, [0]
+
+    class Killed(BaseException):
+        pass
+
+    def watched(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 40:
+            fill(small_disk)
+        if calls[0] == 55:
+            raise Killed
+        return step(*args)
+
+    run.learner.collector.act = watched
+    with pytest.warns(UserWarning, match="no checkpoint at 90 env steps"), pytest.raises(Killed):
+        run.run()
+    run.log.directory.close()
+    (small_disk / "ballast").unlink()
+    resumed = make_run(config, run_dir, resume=True)
+    assert resumed.env_steps == 60
+    resumed.run()
+    assert results(resumed, run_dir) == straight(config)
+
+
+def test_a_run_whose_end_cannot_be_saved_is_not_finished(small_disk, straight, small_config, make_run, results):
+    config = small_config(checkpoint_every=30)
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    step, calls = run.learner.collector.act, [0]
+
+    def watched(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 50:
+            fill(small_disk)
+        return step(*args)
+
+    run.learner.collector.act = watched
+    expected = r"^run_dir=.* made its 140 env steps, but the end could not be saved \(No space left on device\), so "
+    with pytest.warns(UserWarning), pytest.raises(OSError, match=expected):
+        run.run()
+    assert not run.log.directory.finished
+    run.log.directory.close()
+    (small_disk / "ballast").unlink()
+    resumed = make_run(config, run_dir, resume=True)
+    assert resumed.env_steps == 90
+    resumed.run()
+    assert results(resumed, run_dir) == straight(config)
+
+
+def test_a_damaged_buffer_can_be_gone_on_with_on_request(tmp_path, finished, small_config, make_run):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    (run_dir / "summary.json").unlink()
+    manifest = json.loads((run_dir / "checkpoints" / "resume" / f"{140:012d}" / "manifest.json").read_text())["replay"]
+    oldest = run_dir / "checkpoints" / "replay" / manifest["rows"][0]["file"]
+    data = bytearray(oldest.read_bytes())
+    data[len(data) // 2] ^= 1
+    oldest.write_bytes(data)
+    advice = r" is not the file that was written: .*\. resume=weights goes on with the weights and what "
+    with pytest.raises(CheckpointError, match=advice):
+        make_run(small_config(), run_dir, resume=True)
+    config = small_config(resume="weights", total_env_steps=160)
+    with pytest.warns(UserWarning, match=r"140 with its weights and 45 of 70 rows of its buffer; .*damaged\.$"):
+        run = make_run(config, run_dir, resume=True)
+    content = read_agent_file(run_dir / "checkpoints" / "last.pt")
+    assert all(torch.equal(value, content["loss"][name]) for name, value in run.learner.agent.loss.state_dict().items())
+    assert (run.env_steps, len(run.learner.replay)) == (140, 45)
+    run.run()
+    assert (run.env_steps, len(run.learner.replay)) == (160, 55)
+    stored = run.learner.replay[:]
+    assert stored["collector", "traj_ids"][44] < stored["collector", "traj_ids"][45]  # a fresh episode
+    run.log.directory.close()
+    resumed = make_run(config, run_dir, resume=True)  # and whole again
+    assert (stored == resumed.learner.replay[:]).all()
+
+
+def test_too_little_of_a_buffer_is_refused(tmp_path, finished, small_config, make_run):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    for file in (run_dir / "checkpoints" / "replay").glob("rows*"):
+        file.write_bytes(b"")
+    with (
+        pytest.warns(UserWarning, match="and 0 of 70 rows"),
+        pytest.raises(CheckpointError, match=r"^cannot resume: 0 rows of the buffer are left, fewer than the 24 "),
+    ):
+        make_run(small_config(resume="weights"), run_dir, resume=True)
+
+
+def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(
+    small_disk, small_config, make_run, stop_at
+):
+    run = make_run(small_config(), small_disk / "run")
+    stop_at(run, run.learner.collector, "act", 30)
+    fill(small_disk)
+    expected = r"^stopped at \d+ env steps and not saved: the checkpoint before it stays in "
+    with pytest.warns(UserWarning) as warned, pytest.raises(RunInterrupted, match=expected):
+        run.run()
+    assert "no checkpoint at 60 env steps (No space left on device)" in str(warned[-1].message)
+
+
+def test_a_read_only_run_directory_is_refused_and_goes_on_when_it_can_be_written(
+    small_disk, straight, small_config, make_run, results, stop_at
+):
+    config = small_config()
+    run_dir = small_disk / "run"
+    run = make_run(config, run_dir)
+    stop_at(run, run.learner.collector, "act", 40)
+    with pytest.raises(RunInterrupted):
+        run.run()
+    run.log.directory.close()
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    for begin in (lambda: make_run(config, run_dir, resume=True), lambda: make_run(config, small_disk / "new")):
+        with pytest.raises(
+            OSError, match=r"^run_dir=.* cannot be written \(Read-only file system\); choose a directory"
+        ):
+            begin()
+    subprocess.run(["mount", "-o", "remount,rw", str(small_disk)], check=True)
+    resumed = make_run(config, run_dir, resume=True)
+    resumed.run()
+    assert results(resumed, run_dir) == straight(config)
