@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import runpy
+import shutil
 from pathlib import Path
 from types import ModuleType
 
@@ -44,18 +45,25 @@ def train(run_dir: Path, **changes: object) -> None:
     launch(TrainConfig.from_dict(values))
 
 
-def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, monkeypatch):
-    train(tmp_path / "run")
-    files = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of a run, which its reader leaves as it is; who changes it takes a copy."""
+    run_dir = tmp_path_factory.mktemp("trained") / "run"
+    train(run_dir)
+    return run_dir
+
+
+def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, trained, monkeypatch):
+    files = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
     script = runpy.run_path(str(BENCHMARKS / "moments.py"))
     monkeypatch.setattr("sys.argv", [
-        "moments.py", str(tmp_path / "run"), "--every", "50", "--times", "4", "--out", str(tmp_path / "moments.csv"),
+        "moments.py", str(trained), "--every", "50", "--times", "4", "--out", str(tmp_path / "moments.csv"),
     ])  # fmt: skip
     script["main"]()
     with open(tmp_path / "moments.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["env_steps"] for row in rows] == ["300", "350", "400", "450", "500"]
-    with open(RunDirectory(tmp_path / "run").eval, newline="", encoding="utf-8") as file:
+    with open(RunDirectory(trained).eval, newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
     # The weights of the checkpoint, in the episodes that the run played; the averages begin with them.
     assert {rows[0][name] for name in ("latest", *script["COMPARED"]["averages"])} == {
@@ -64,20 +72,19 @@ def test_a_run_is_evaluated_from_moment_to_moment_and_stays_as_it_is(tmp_path, m
     assert any(row["in training"] for row in rows)
     assert all(row["policy"] for row in rows)
     assert len({row["average 0.98"] for row in rows}) > 1
-    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == files
+    assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == files
 
 
-def test_a_moment_is_played_as_an_evaluation_and_as_in_training(tmp_path, monkeypatch):
-    train(tmp_path / "run")
+def test_a_moment_is_played_as_an_evaluation_and_as_in_training(tmp_path, trained, monkeypatch):
     script = runpy.run_path(str(BENCHMARKS / "moments.py"))
     monkeypatch.setattr("sys.argv", [
-        "moments.py", str(tmp_path / "run"), "--every", "50", "--times", "1", "--compare", "acting",
+        "moments.py", str(trained), "--every", "50", "--times", "1", "--compare", "acting",
         "--out", str(tmp_path / "moments.csv"),
     ])  # fmt: skip
     script["main"]()
     with open(tmp_path / "moments.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    with open(RunDirectory(tmp_path / "run").eval, newline="", encoding="utf-8") as file:
+    with open(RunDirectory(trained).eval, newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
     assert rows[0]["latest"] == f"{float(last['return_mean']):.0f}"
     ways = ("latest", *script["COMPARED"]["acting"])
@@ -92,7 +99,7 @@ def test_what_moments_cannot_go_on_with_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path), "--times", "0"])
     with pytest.raises(SystemExit, match="--every and --times must be at least 1"):
         script["main"]()
-    train(tmp_path / "averaged", optim=SMALL["optim"] | {"average_decay": 0.9})
+    train(tmp_path / "averaged", total_env_steps=100, optim=SMALL["optim"] | {"average_decay": 0.9})
     monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path / "averaged")])
     with pytest.raises(SystemExit, match="plans with averaged weights already"):
         script["main"]()
@@ -159,17 +166,16 @@ def test_frozen_agents_refuses_what_it_cannot_play(tmp_path, monkeypatch):
         script["main"]()
 
 
-def test_values_stand_beside_what_the_next_step_makes_of_them(tmp_path, monkeypatch, capsys):
-    train(tmp_path / "run")
+def test_values_stand_beside_what_the_next_step_makes_of_them(tmp_path, trained, monkeypatch, capsys):
     script = runpy.run_path(str(BENCHMARKS / "kept_values.py"))
-    command = ["kept_values.py", str(tmp_path / "run"), "--every", "10", "--out", str(tmp_path / "values.csv")]
+    command = ["kept_values.py", str(trained), "--every", "10", "--out", str(tmp_path / "values.csv")]
     monkeypatch.setattr("sys.argv", command)
     script["main"]()
     table = pd.read_csv(tmp_path / "values.csv")
     assert list(table.columns) == script["COLUMNS"]
     assert table.groupby("who").size().to_dict() == {"planner": 50, "policy alone": 50}
     assert capsys.readouterr().out.count("in the mean: ") == 2
-    agent, config, _ = load_agent(RunDirectory(tmp_path / "run").last_agent, compile_setting="off")
+    agent, config, _ = load_agent(RunDirectory(trained).last_agent, compile_setting="off")
     episode = play_episode(agent.eval_planner, config.task_spec, seed=100)
     rows = table[table["who"] == "planner"]
     with torch.no_grad():
@@ -191,11 +197,10 @@ def test_what_has_no_values_to_look_at_is_one_line(tmp_path, monkeypatch):
         script["main"]()
 
 
-def test_plans_of_one_state_stand_beside_each_other(tmp_path, monkeypatch, capsys):
-    train(tmp_path / "run")
+def test_plans_of_one_state_stand_beside_each_other(tmp_path, trained, monkeypatch, capsys):
     script = runpy.run_path(str(BENCHMARKS / "repeated_plans.py"))
     options = ["--states", "10", "--repeats", "4", "--out", str(tmp_path / "plans.csv")]
-    monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(tmp_path / "run"), *options])
+    monkeypatch.setattr("sys.argv", ["repeated_plans.py", str(trained), *options])
     script["main"]()
     assert "10 states, 4 plans each" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "plans.csv").set_index("setting")
@@ -204,10 +209,9 @@ def test_plans_of_one_state_stand_beside_each_other(tmp_path, monkeypatch, capsy
     assert table.loc["wide, BMPC's budget", "spread"] < table.loc["wide", "spread"]  # a search of many repeats itself
 
 
-def test_the_divergence_of_two_plans_is_that_of_their_gaussians(tmp_path):
-    train(tmp_path / "run")
+def test_the_divergence_of_two_plans_is_that_of_their_gaussians(trained):
     script = runpy.run_path(str(BENCHMARKS / "repeated_plans.py"))
-    agent, config, _ = load_agent(RunDirectory(tmp_path / "run").last_agent, compile_setting="off")
+    agent, config, _ = load_agent(RunDirectory(trained).last_agent, compile_setting="off")
     latent = torch.softmax(torch.randn(3, config.model.latent_dim), -1)
     planner = agent.reanalyze_planner
     torch.manual_seed(0)
@@ -290,16 +294,16 @@ def faults(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("faults")
 
 
-def test_what_a_killed_run_came_to_includes_the_rows_of_its_buffer(tmp_path, faults):
-    train(tmp_path / "run")
-    directory = RunDirectory(tmp_path / "run")
-    expected = faults.results(tmp_path / "run")
-    assert faults.results(tmp_path / "run") == expected
+def test_what_a_killed_run_came_to_includes_the_rows_of_its_buffer(tmp_path, trained, faults):
+    run = shutil.copytree(trained, tmp_path / "run")
+    directory = RunDirectory(run)
+    expected = faults.results(run)
+    assert faults.results(run) == expected
     buffer = build_replay(read_run_config(directory))
     CheckpointStore(directory.checkpoints).load({}, buffer)
     buffer.storage[:]["next", "reward"][7] += 1
     CheckpointStore(directory.checkpoints).save(1000, {}, buffer)
-    found = faults.results(tmp_path / "run")
+    found = faults.results(run)
     assert [name for name in expected if found[name] != expected[name]] == ["buffer"]
 
 
