@@ -68,6 +68,20 @@ def test_a_model_of_action_values_needs_a_policy(monkeypatch):
         require_prediction_model(model)
 
 
+def test_a_member_that_is_none_is_missing_but_for_the_size_of_an_observation():
+    model = Pendulum()
+    model.observation_dim = None
+    require_prediction_model(model)
+    model.act = None  # half a policy
+    with pytest.raises(TypeError, match="^world_model must have .*, got Pendulum without act; see "):
+        require_prediction_model(model)
+    model.policy = None
+    require_prediction_model(model)
+    model.action_values, model.num_values = (lambda latent, action: latent), 2
+    with pytest.raises(TypeError, match="^world_model must have .*, got Pendulum without policy, act; see "):
+        require_prediction_model(model)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_model_of_ones_own_is_planned_over_in_the_dtype_of_its_input(dtype):
     planner = EnsembleMPPIPlanner(LatentEnv(Pendulum(), dtype=dtype), score="final", warm_start=False)

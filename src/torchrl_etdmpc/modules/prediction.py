@@ -169,7 +169,9 @@ def require_prediction_model(model: object) -> None:
     members = [*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_"))]
     members += _POLICY if has_policy(model) else ()
     members += (*_POLICY, "num_values") if has_action_values(model) else ()
-    missing = [name for name in dict.fromkeys(members) if not hasattr(model, name)]
+    # None says something as observation_dim alone.
+    absent = [name for name in dict.fromkeys(members) if getattr(model, name, None) is None]
+    missing = [name for name in absent if name != "observation_dim" or not hasattr(model, name)]
     if missing:
         raise TypeError(
             f"world_model must have the members of PredictionModel, got {type(model).__name__} without "
