@@ -496,7 +496,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     @torch.no_grad()
     def imagined_returns(self, latent: Tensor, actions: Tensor) -> Tensor:
-        """The return table that sequences are scored by, in the dtype of scoring (thesis Eq. 3.1).
+        """The return table that sequences are scored by (thesis Eq. 3.1): imagined in the dtype of scoring, and summed in
+        that of the latents.
 
         With an :class:`~torchrl_etdmpc.modules.ActionValueModel` by its values of the state, without a draw.
 
