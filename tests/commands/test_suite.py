@@ -195,7 +195,7 @@ def test_an_experiment_is_trained_told_and_grown(call, mine, trained, tmp_path):
     assert out.splitlines()[-1] == "4 runs: 4 finished"
     assert len(trained[1].runs) == 4
     stored = read_experiment(tmp_path / "here" / "experiment.yaml")
-    assert (list(stored.variants), stored.seeds, stored.budget, stored.base) == (["b", "a"], (1, 2), 500, "b")
+    assert (list(stored.variants), stored.seeds, stored.budget, stored.base) == (["b", "a"], (1, 2), 500, "a")
     message, out = call("status", "runs_dir=here")
     assert message is None
     assert out.splitlines()[0].startswith("variant  task       seeds done")

@@ -54,6 +54,25 @@ def test_what_is_written_is_read_again(write, tmp_path):
     assert experiment.searches["tuned"].settings == {"loss.rho": 0.4}
 
 
+@pytest.mark.parametrize("spelling", ["action_repeat", "task.action_repeat", "nested"])
+def test_settings_of_the_task_are_one_setting_however_they_are_spelled(write, tmp_path, spelling):
+    repeats = {name: {"task": {"action_repeat": 4}} if spelling == "nested" else {spelling: 4} for name in "ab"}
+    for own in ("action_repeat", "task.action_repeat"):
+        file = write(variants=repeats, settings={"preset": "cpu", own: 2}, base=None)
+        for changes, expected in (({}, 4), ({"settings": {"task.action_repeat": 1}}, 1)):
+            runs = read_experiment(file, **changes).runs(tmp_path)
+            assert {run.config.action_repeat for run in runs} == {expected}
+    search = {"search": {"action_repeat": [1, 2]}, "trials": 2}
+    with pytest.raises(ValueError, match=r"searches task\.action_repeat, which is given as well"):
+        read_experiment(write(variants={"tuned": search | {"task.action_repeat": 4}}, base=None))
+
+
+def test_a_setting_of_the_task_under_both_of_its_names_is_refused(write):
+    both = {"action_repeat": 2, "task.action_repeat": 4}
+    with pytest.raises(ValueError, match=r"sets action_repeat and task\.action_repeat, which are the same; leave one"):
+        read_experiment(write(variants={"a": both}, base=None))
+
+
 def test_a_base_that_is_not_named_is_the_first_variant_from_then_on(write, tmp_path):
     write_experiment(read_experiment(write(base=None)), tmp_path / "experiment.yaml")
     assert read_experiment(tmp_path / "experiment.yaml").base == "one"

@@ -151,6 +151,12 @@ def test_a_run_that_fails_is_tried_again_and_then_named(stand_in_script, submit,
     assert requeued(tmp_path) == []
 
 
+def test_a_run_that_fails_is_tried_again_as_long_as_it_gets_further(stand_in_script, submit, small):
+    runs, script = stand_in_script({"": [("fail", 100), ("fail", 200), ("fail", 300), ("finish", 400)]}, retries=0)
+    assert submit(script, 0).wait() == 0
+    assert small.tries(runs[0]) == 4
+
+
 @contextlib.contextmanager
 def locked(run):
     """As if another process trained it."""

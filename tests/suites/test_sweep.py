@@ -73,6 +73,31 @@ def test_a_study_lies_in_its_folder_whatever_that_is_called(search, tmp_path, na
         assert [file.relative_to(tmp_path) for file in tmp_path.rglob("*")] == [Path(name), Path(name, "sweeps.sqlite")]
 
 
+@pytest.mark.parametrize("found_by", ["the settings", "the parts"])
+def test_a_proposal_that_cannot_be_trained_is_a_failed_trial_and_leaves_no_variant(search, small, tmp_path, found_by):
+    import optuna
+
+    def check(run) -> None:
+        if found_by == "the parts" and (run.config.optim.batch_size, run.config.model.mlp_dim) == (8, 32):
+            raise ValueError("too much for them")
+
+    fits = {"optim.batch_size": [4, 8], "model.mlp_dim": [16, 32]}
+    conflicts = {"num_envs": [1, 8], "replay.insertion": ["step", "episode"]}
+    kept, said = {}, []
+    settings = small.settings | {"replay.seed_decisions": 200}  # which are two episodes
+    asked = search(12, False, fits if found_by == "the parts" else conflicts, settings=settings, budget=900)
+    parts = kept.__setitem__, check, said.append
+    train(small, Sweep(asked, "tuned", tmp_path, *parts))
+    trials = study_of(tmp_path).trials
+    failed = [trial.number for trial in trials if trial.state == optuna.trial.TrialState.FAIL]
+    assert len(trials) == 12 and 0 < len(failed) < 12
+    assert {tuple(trials[number].params.values()) for number in failed} in ({(8, "episode")}, {(8, 32)})
+    assert list(kept) == [f"tuned trial {number}" for number in range(12) if number not in failed]
+    assert [line.partition(": cannot be trained: ")[0] for line in said] == [f"tuned trial {one}" for one in failed]
+    again = Sweep(asked, "tuned", tmp_path, *parts)
+    assert again.done and again.propose() == []
+
+
 def test_ranges_of_whole_numbers_propose_whole_numbers(search, tmp_path):
     sweep = Sweep(search(space={"planner.horizon": {"low": 2, "high": 5}}), "tuned", tmp_path)
     horizons = [sweep.propose()[0].config.planner.horizon for _ in range(6)]

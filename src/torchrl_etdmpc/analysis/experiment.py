@@ -88,7 +88,7 @@ def read_experiment(root: Path) -> Experiment:
             f"{file} does not list variants, tasks, seeds and a budget, so that nobody can say which runs are missing."
         ) from error
     variants, tasks, seeds = (tuple(items) for items, _ in lists.values())
-    return Experiment(root, variants, tasks, seeds, budget, values.get("base"), own)
+    return Experiment(root, variants, tasks, seeds, budget, values.get("base") or variants[0], own)
 
 
 def experiment_root(run: Path) -> Path | None:

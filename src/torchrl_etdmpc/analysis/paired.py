@@ -56,7 +56,7 @@ def compare_paired(
 
     Returns:
         DataFrame: a row per variant and task with pairs, then over these tasks: ``variant, base, task, pairs,
-        left_out`` (runs of either without a partner), ``difference, lower, upper, improvement, improvement_lower,
+        left_out`` (runs of either that are in no pair), ``difference, lower, upper, improvement, improvement_lower,
         improvement_upper``. Limits are NaN where a task has one pair.
 
     >>> rows = [(m, "x", seed, 9, seed + 2.0 * (m == "b")) for m in "ab" for seed in (1, 2)]
@@ -72,6 +72,7 @@ def compare_paired(
     scores = interpolate(seed_estimates(chosen), np.array([float(env_steps)])).dropna(subset="mean")
     scores = scores.set_index(["method", "task", "seed"])["mean"]
     by_run = {key: dict(rows.droplevel([0, 1])) for key, rows in scores.groupby(level=["method", "task"])}
+    there = chosen.groupby(["method", "task"])["seed"].nunique()
     random = np.random.default_rng(seed)
     rows = []
     for variant in variants:
@@ -79,7 +80,7 @@ def compare_paired(
         for task in tasks:
             ours, theirs = by_run.get((variant, task), {}), by_run.get((base, task), {})
             shared = sorted(set(ours) & set(theirs))
-            alone = len(set(ours) ^ set(theirs))
+            alone = sum(there.get((method, task), 0) for method in (variant, base)) - 2 * len(shared)
             left_out += alone
             if not shared:
                 continue

@@ -233,7 +233,10 @@ def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: 
             if variant not in known.variants:
                 write_experiment(dataclasses.replace(known, variants={**known.variants, variant: settings}), file)
 
-    sweeps = [Sweep(asked, name, folder, keep) for name in asked.searches]
+    def check(run: Run) -> None:
+        _require_parts([(run.variant, run.config)])
+
+    sweeps = [Sweep(asked, name, folder, keep, check, _say) for name in asked.searches]
     runs = [*runs, *(run for sweep in sweeps for run in sweep.runs())]
     queue = RunQueue(runs, retries=config.retries, say=_say, trials=sweeps)
     with console():
@@ -368,8 +371,9 @@ def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
         seeds = [_value(seed) for seed in _listed(config.seeds)]
         changes["seeds"] = seeds if "," in config.seeds or config.seeds.startswith("[") else seeds[0]
     experiment = read_experiment(find_experiment(config.experiment, EXPERIMENTS), **changes)
+    base = experiment.base or next(iter(experiment.variants), None)  # whichever command comes first
     if not config.variants:
-        return experiment
+        return dataclasses.replace(experiment, base=base)
     chosen, known = _listed(config.variants), [*experiment.variants, *experiment.searches]
     for name in chosen:
         if name not in known:
@@ -378,7 +382,7 @@ def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
         experiment,
         variants={name: settings for name, settings in experiment.variants.items() if name in chosen},
         searches={name: search for name, search in experiment.searches.items() if name in chosen},
-        base=experiment.base if experiment.base in chosen else None,  # then it is the folder's, if that has one
+        base=base if base in chosen else None,  # then it is the folder's, if that has one
     )
 
 

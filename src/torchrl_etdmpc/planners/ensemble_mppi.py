@@ -496,8 +496,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     @torch.no_grad()
     def imagined_returns(self, latent: Tensor, actions: Tensor) -> Tensor:
-        """The return table that sequences are scored by (thesis Eq. 3.1): imagined in the dtype of scoring, and summed in
-        that of the latents.
+        """The return table that sequences are scored by (thesis Eq. 3.1).
+
+        It is imagined in the dtype of scoring and summed in that of the latents.
 
         With an :class:`~torchrl_etdmpc.modules.ActionValueModel` by its values of the state, without a draw.
 

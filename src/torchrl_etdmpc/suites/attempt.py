@@ -15,7 +15,8 @@ from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.directory import IN_USE
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.suites.experiment import Run
-from torchrl_etdmpc.training import EXIT_CODE, TASK_SETTINGS, preset
+from torchrl_etdmpc.training import EXIT_CODE, preset
+from torchrl_etdmpc.training.config import typed_name
 
 End = Literal["finished", "stopped", "elsewhere", "failed"]
 Verdict = Literal["failed", "pruned"]
@@ -39,7 +40,7 @@ def command(run: Run, **more: Any) -> list[str]:
     settings = {name: value for name, value in flat(config.to_dict()).items() if name not in first}
     differing = {name: value for name, value in settings.items() if value != usual[name]}
     values = first | differing | {"run_dir": str(run.path), "resume": "auto"} | more
-    typed = {f"task.{name}" if name in TASK_SETTINGS else name: value for name, value in values.items()}
+    typed = {typed_name(name): value for name, value in values.items()}
     words = [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in typed.items()]
     return [sys.executable, "-m", "torchrl_etdmpc.commands", "train", *words]
 

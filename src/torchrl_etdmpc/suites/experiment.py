@@ -17,7 +17,8 @@ from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import DamagedFileError, RunDirectory
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.runs.files import read_whole, write_whole
-from torchrl_etdmpc.training import CHANGEABLE, TASK_SETTINGS, TrainConfig, preset, read_run_config
+from torchrl_etdmpc.training import CHANGEABLE, TrainConfig, preset, read_run_config
+from torchrl_etdmpc.training.config import typed_name
 
 TASK_SETS: dict[str, tuple[str, ...]] = {
     **{name: benchmark.tasks for name, benchmark in BENCHMARKS.items()},
@@ -84,7 +85,8 @@ class Search:
             holds whole numbers.
         trials (int): how many are made.
         settings (mapping): those that all trials share.
-        prune (bool): whether a trial ends early whose return is below the median of those before it, at the same step.
+        prune (bool): whether a trial ends early whose best return so far is below the median of what those before it
+            returned at the same step.
 
     Raises:
         ValueError: if the space is empty, or an entry is neither.
@@ -117,7 +119,11 @@ class Search:
         return type(low) is type(high) is int or (counted and float(low).is_integer() and float(high).is_integer())
 
     def points(self) -> list[dict[str, Any]]:
-        """Every value of a list and both ends of a range, one at a time: if these can be trained, all can."""
+        """Every value of a list and both ends of a range, one at a time.
+
+        What is wrong with one of them is so refused before anything is trained; what two of them are together shows
+        when they are proposed.
+        """
         ends = {
             name: [values["low"], values["high"]] if isinstance(values, Mapping) else values
             for name, values in self.space.items()
@@ -206,7 +212,7 @@ class Experiment:
         return self._config(variant, self.variants[variant], task, seed)
 
     def _config(self, variant: str, own: Mapping[str, Any], task: str, seed: int) -> TrainConfig:
-        settings = {**self.settings, **own}
+        settings = _spelled(self.settings) | _spelled(own)
         try:
             name = settings.pop("preset", "efficient-tdmpc")
             _require(isinstance(name, str), f"preset must be a name, got {name!r}.")
@@ -271,7 +277,7 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
               optim.lr: {low: 1e-4, high: 3e-3, log: true}
               model.mlp_dim: [64, 128]
             trials: 20
-            prune: true            # end a trial early whose return is below the median of those before it
+            prune: true            # end a trial early whose best return so far is below the median of those before it
         base: cpu                  # the one that reports compare the others with
 
     Args:
@@ -303,7 +309,7 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
         values.get("budget", "benchmark") == "benchmark" or "total_env_steps" not in shared,
         f"{file} says budget and, in its settings, total_env_steps, which are the same; leave one out.",
     )
-    more = dict(changes.get("settings") or {})
+    more = _spelled(changes.get("settings") or {})
     budget: Any = more.get("total_env_steps", shared.pop("total_env_steps", values.get("budget", "benchmark")))
     budget = int(budget) if isinstance(budget, float) and budget.is_integer() else budget
     _require(
@@ -429,7 +435,7 @@ def _changed(old: TrainConfig, new: TrainConfig) -> tuple[str, str] | None:
     before, now = flat(old.to_dict()), flat(new.to_dict())
     for name, value in now.items():
         if before[name] != value and name not in CHANGEABLE:
-            return f"{'task.' * (name in TASK_SETTINGS)}{name}={before[name]}", str(value)
+            return f"{typed_name(name)}={before[name]}", str(value)
     return None
 
 
@@ -460,12 +466,12 @@ def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str
             continue
         _require(isinstance(settings["search"], dict), f"{what} must search settings by name.")
         fixed = dict(settings)
-        space, trials, prune = fixed.pop("search"), fixed.pop("trials", None), fixed.pop("prune", True)
+        space, trials, prune = _spelled(fixed.pop("search")), fixed.pop("trials", None), fixed.pop("prune", True)
         shared = _replaced(_settings(fixed, what), more)
         both = sorted(set(map(str, space)) & set(shared))
         _require(not both, f"{what} searches {', '.join(both)}, which is given as well.")
         try:
-            searches[name] = Search(dict(space), trials, shared, prune)
+            searches[name] = Search(space, trials, shared, prune)
         except ValueError as error:
             raise ValueError(f"{what}: {error}") from error
     return variants, searches
@@ -491,8 +497,17 @@ def _settings(values: Any, what: str) -> dict[str, Any]:
     _require(values is None or isinstance(values, Mapping), f"{what} must be settings by name, got {values!r}.")
     settings = flat(values or {})
     for name in settings:
+        _require(
+            name == typed_name(name) or typed_name(name) not in settings,
+            f"{what} sets {name} and {typed_name(name)}, which are the same; leave one out.",
+        )
         _require(name not in _THE_SUITES_OWN, f"{what} sets {name}, which a suite gives each run itself.")
-    return settings
+    return _spelled(settings)
+
+
+def _spelled(settings: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Settings by one name each: those of the task as a command line writes them."""
+    return {typed_name(name): value for name, value in settings.items()}
 
 
 def _tasks(given: Any, what: object) -> tuple[str, ...]:

@@ -36,6 +36,7 @@ say() {{  # in a line of its own: a process that was killed may have left one op
 }}
 
 tries=0
+furthest=0
 while :; do
     say "{begun}"
     "$@" >> "$log" 2>&1 &
@@ -61,6 +62,11 @@ while :; do
         exit {code}
     fi
     tries=$((tries + 1))
+    steps=$(tail -n 1 "$(dirname "$log")/train.csv" 2> /dev/null | cut -d , -f 1)
+    if [ "$steps" -gt "$furthest" ] 2> /dev/null; then  # it got further than the tries before
+        tries=0
+        furthest=$steps
+    fi
     [ "$tries" -gt {retries} ] && break
 done
 say "{failed}$(tail -n 1 "$log" | sed 's/^error: //')"
@@ -85,7 +91,7 @@ def write_slurm_script(
         sbatch (str): options of sbatch, e.g. ``"--partition=gpu --gres=gpu:1 --time=12:00:00"``; ``--signal`` among
             them replaces ours, which comes 120 s before the end.
         workers (int, optional): runs at a time. Default: as many as SLURM lets.
-        retries (int): tries of a run that fails, in the job that it has. Default: ``2``.
+        retries (int): tries of a run that fails without getting further, in the job that it has. Default: ``2``.
 
     Returns:
         Path: of the script.

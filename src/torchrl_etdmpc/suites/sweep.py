@@ -22,17 +22,20 @@ class Sweep:
     """The trials of one search, remembered in an SQLite file.
 
     A trial is a variant by the name of ``"{name} trial {number}"``; its value, which is maximised, is the mean over the
-    experiment's tasks and seeds of the last return. After each evaluation that all runs of a trial have reached, their
-    mean is compared with that of the finished trials at the same env step: below the median of five or more, the trial
-    ends (Optuna's ``MedianPruner``). A trial that was running when the process was killed goes on under the same
-    settings; so does, in the next process, one of whose runs was given up. Processes that share the folder share the
-    trials: each follows those that were open when it began and those that it proposed itself.
+    experiment's tasks and seeds of the last return. After each evaluation that all runs of a trial have reached, the
+    best of their means so far is compared with the means of the finished trials at the same env step: below the median
+    of five or more, the trial ends (Optuna's ``MedianPruner``). A trial that was running when the process was killed
+    goes on under the same settings; so does, in the next process, one of whose runs was given up. A proposal that
+    cannot be trained, because of what two of its settings are together, is a failed trial. Processes that share the
+    folder share the trials: each follows those that were open when it began and those that it proposed itself.
 
     Args:
         experiment (Experiment): that holds the search.
         name (str): of the search.
         folder (Path): of the runs; the studies are in its ``sweeps.sqlite``.
         keep (callable, optional): gets name and settings of a variant before its first run begins.
+        check (callable, optional): gets a run of a proposal; raises ``ValueError`` if it cannot be trained.
+        say (callable, optional): gets a line on a proposal that cannot.
 
     Raises:
         ImportError: if Optuna is missing.
@@ -52,10 +55,12 @@ class Sweep:
         name: str,
         folder: Path,
         keep: Callable[[str, dict[str, Any]], None] = lambda name, settings: None,
+        check: Callable[[Run], None] = lambda run: None,
+        say: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.experiment, self.name, self.folder = experiment, name, folder
         self.search: Search = experiment.searches[name]
-        self._keep = keep
+        self._keep, self._check, self._say = keep, check, say
         self._study = _study(folder / "sweeps.sqlite", name, self.search)
         self._open: dict[int, list[Run]] = {}
         self._spent = 0
@@ -69,20 +74,21 @@ class Sweep:
 
     def propose(self) -> list[Run]:
         """The runs of one more trial; none if there are enough."""
-        if self._spent >= self.search.trials:
-            return []
         import optuna
 
-        known = self._study.get_trials(deepcopy=False)
-        self._spent = sum(map(self._is_whole, known))  # another process may have proposed some
-        if self._spent >= self.search.trials:
-            return []
-
-        # With one seed for all, a search that goes on after a kill would draw its first proposals again.
-        self._study.sampler = optuna.samplers.TPESampler(seed=len(known))
-        trial = self._study.ask(_distributions(self.search))
-        self._spent += 1
-        return self._begin(trial.number, trial.params)
+        while self._spent < self.search.trials:
+            known = self._study.get_trials(deepcopy=False)
+            self._spent = sum(map(self._is_whole, known))  # another process may have proposed some
+            if self._spent >= self.search.trials:
+                break
+            # With one seed for all, a search that goes on after a kill would draw its first proposals again.
+            self._study.sampler = optuna.samplers.TPESampler(seed=len(known))
+            trial = self._study.ask(_distributions(self.search))
+            self._spent += 1
+            runs = self._begin(trial.number, trial.params)
+            if runs:
+                return runs
+        return []
 
     def runs(self) -> list[Run]:
         """Those of the open trials."""
@@ -143,9 +149,17 @@ class Sweep:
         return set(trial.params) == set(self.search.space)
 
     def _begin(self, number: int, point: dict[str, Any]) -> list[Run]:
+        """The runs of a trial; none, and a failed trial, if they cannot be trained."""
+        try:
+            runs = self._runs(number, point)
+            self._check(runs[0])
+        except ValueError as error:
+            self._say(f"{self._variant(number)}: cannot be trained: {first_line(error)}")
+            self._tell(number, math.nan)
+            return []
         self._keep(self._variant(number), {**self.search.settings, **point})
-        self._open[number] = self._runs(number, point)
-        return self._open[number]
+        self._open[number] = runs
+        return runs
 
     def _runs(self, number: int, point: dict[str, Any]) -> list[Run]:
         variants = {self._variant(number): {**self.search.settings, **point}}

@@ -28,6 +28,17 @@ from torchrl_etdmpc.training.own_code import OWN_CODE, own_code
 
 TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
 """Written as ``task.action_repeat`` etc. on the command line; ``task`` itself is a name, not a group."""
+
+
+def typed_name(name: str) -> str:
+    """A setting as it is written on the command line.
+
+    >>> typed_name("action_repeat"), typed_name("seed"), typed_name("task.action_repeat")
+    ('task.action_repeat', 'seed', 'task.action_repeat')
+    """
+    return f"task.{name}" if name in TASK_SETTINGS else name
+
+
 MOST_EPISODES = 10_000
 """Of one evaluation: each is an environment in memory."""
 

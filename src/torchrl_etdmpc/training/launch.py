@@ -22,7 +22,7 @@ from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logge
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
-from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
+from torchrl_etdmpc.training.config import TrainConfig, typed_name
 from torchrl_etdmpc.training.distributed import DistributedConfig, is_distributed
 from torchrl_etdmpc.training.estimate import what_it_takes
 from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
@@ -307,15 +307,10 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
             values[name] = wanted[name]
         elif values.get(name) != wanted.get(name):
             raise ValueError(
-                f"{_typed(name)}={wanted.get(name)} was asked for, but this run was started with "
-                f"{_typed(name)}={values.get(name)}; leave it out to go on, or start a new run_dir."
+                f"{typed_name(name)}={wanted.get(name)} was asked for, but this run was started with "
+                f"{typed_name(name)}={values.get(name)}; leave it out to go on, or start a new run_dir."
             )
     return type(saved).from_dict(_nested(values))
-
-
-def _typed(name: str) -> str:
-    """A setting as it is written on the command line."""
-    return f"task.{name}" if name in TASK_SETTINGS else name
 
 
 def _nested(values: dict[str, Any]) -> dict[str, Any]:
