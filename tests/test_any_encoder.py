@@ -34,6 +34,7 @@ from torchrl_etdmpc import (
     export_planner,
 )
 from torchrl_etdmpc.functional import simnorm
+from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
 
@@ -241,6 +242,19 @@ def test_a_world_model_without_a_size_needs_an_encoder():
 def test_an_encoder_of_images_is_short():
     lines = [line for line in inspect.getsource(PixelEncoder).splitlines() if line.strip()]
     assert len(lines) + 1 <= 15  # and the line that passes it
+
+
+def test_an_encoder_that_writes_something_else_is_named_with_what_it_should_write():
+    wide = WorldModel(None, 1, encoder=nn.Linear(3, 24), latent_dim=16, mlp_dim=16)
+    text = r"^the encoder must write latents \[\.\.\., L\], here L = latent_dim = 16, got \[.*24\]\.$"
+    with pytest.raises(ValueError, match=text):
+        EnsembleMPPIPlanner(LatentEnv(wide)).plan(torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=text):
+        EfficientTDMPCModelLoss(wide)(random_slices(3, 1))
+    layers = nn.Sequential(nn.Linear(3, 16), nn.Flatten(0, -2))  # takes all steps of all slices for one batch
+    flat = WorldModel(None, 1, encoder=layers, latent_dim=16, mlp_dim=16)
+    with pytest.raises(ValueError, match=r"must make \[4, 16\] and \[3, 4, 16\], got \[4, 16\] and \[12, 16\]\.$"):
+        EfficientTDMPCModelLoss(flat)(random_slices(3, 1))
 
 
 def test_an_encoder_with_nothing_to_learn_trains_the_rest():

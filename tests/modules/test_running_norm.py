@@ -47,6 +47,23 @@ def test_a_batch_that_is_not_finite_is_forgotten():
     assert torch.equal(norm.variance, before[1])
 
 
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, 1e30])
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_batch_that_is_not_finite_is_no_batch_also_where_it_is_the_first(wrong, masked):
+    norm, rows = RunningNorm(2), torch.randn(8, 2)
+    rows[3, 1] = wrong
+    counts = torch.arange(8) < 5 if masked else None
+    norm.observe(rows, counts)
+    assert norm.batches == 0
+    assert (norm.mean.tolist(), norm.variance.tolist()) == ([0, 0], [1, 1])
+    seen = 100 + torch.randn(64, 2)
+    norm.observe(seen)
+    torch.testing.assert_close(norm.mean, seen.mean(0))
+    torch.testing.assert_close(norm.variance, seen.var(0, correction=0))
+    norm.observe(rows, torch.arange(8) != 3)  # what does not count may be anything
+    assert norm.batches == 2
+
+
 def test_a_batch_of_which_nothing_counts_is_no_batch():
     first, second = torch.randn(8, 2), torch.randn(8, 2) + 3
     plain, padded = RunningNorm(2), RunningNorm(2)

@@ -149,6 +149,16 @@ def test_what_torchrl_s_multi_step_makes_of_an_episode_is_refused(make_loss, sli
         make_loss("model")(batch)
 
 
+def test_an_end_inside_a_slice_is_found_by_the_name_that_it_was_given(make_loss, slices):
+    loss = make_loss("whole").eval()
+    slices["next", "agent", "over"] = torch.zeros_like(slices["next"].pop("done"))
+    loss.set_keys(done=("agent", "over"))
+    loss(slices)
+    slices["next", "agent", "over"][2, 1] = True
+    with pytest.raises(ValueError, match=r"^\('next', 'agent', 'over'\) is True before the last step of a slice, so "):
+        loss(slices)
+
+
 def test_an_episode_that_ends_inside_a_slice_is_refused_unless_the_rest_is_masked(make_loss, slices, run_seeded):
     loss = make_loss("whole").eval()
     slices["next", "done"][:] = False

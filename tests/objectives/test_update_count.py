@@ -100,6 +100,12 @@ def test_a_cast_loss_goes_on_counting(make_loss, world_model, slices, total):
     assert world_model.version == 3
 
 
+def test_the_steps_of_a_compiled_world_model_count(make_loss, world_model, slices, total):
+    loss = make_loss("whole", torch.compile(world_model, backend="eager"))
+    train(loss, torch.optim.Adam(loss.parameters()), slices=slices, total=total)
+    assert world_model.version == 3
+
+
 def test_a_compiled_step_counts(make_loss, world_model, slices, total):
     loss = make_loss("whole", world_model)
     optimizer = torch.optim.Adam(loss.parameters())

@@ -86,7 +86,10 @@ def test_a_world_without_parameters_is_cast_too():
 def test_out_keys_can_be_selected(keys, warm):
     planner = make_planner()
     everything = planner.out_keys
-    planner.select_out_keys(*keys)
+    with pytest.warns(
+        UserWarning, match=r"^without \('next', 'plan_mean'\) every plan starts cold; leave it among the"
+    ):
+        planner.select_out_keys(*keys)
     data = states() if warm else states().select("observation").set("is_init", torch.ones(5, 1, dtype=torch.bool))
     given = set(data.keys())
     out = planner(data)
@@ -97,10 +100,14 @@ def test_out_keys_can_be_selected(keys, warm):
 
 def test_a_cold_planner_without_flags_lets_its_keys_be_selected():
     planner = make_planner()
-    planner.select_out_keys("action")
+    planner.select_out_keys("action", ("next", "plan_mean"))
     with pytest.warns(UserWarning, match="every plan starts cold"):
         out = planner(states().select("observation"))
     assert set(out.keys(True, True)) == {"observation", "action"}
+
+
+def test_the_keys_of_a_planner_that_starts_cold_are_selected_in_silence():
+    assert make_planner(warm_start=False).select_out_keys("action").out_keys == ["action"]
 
 
 def test_forward_takes_a_generator():

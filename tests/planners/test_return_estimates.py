@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_etdmpc import FinalScore
+from torchrl_etdmpc import AdaptiveScore, FinalScore, MeanScore
 from torchrl_etdmpc.testing import LineWorld
 
 
@@ -40,22 +40,11 @@ def test_every_return_estimate_is_that_of_a_head_on_its_own_rollout(termination,
     assert all(trace.returns.std(dim).min() > 1e-6 for dim in (2, 3, 4, 5))
 
 
-class CoarseWorld(LineWorld):
-    """Predicts in the dtype of its inputs, as a model without buffers does."""
-
-    def next(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        return super().next(latent, action).to(latent.dtype)
-
-    def values(self, latent: torch.Tensor) -> torch.Tensor:
-        return super().values(latent).to(latent.dtype)
-
-
-def test_returns_have_the_digits_of_the_latents_whatever_dtype_imagines_them(make_planner):
-    planner = make_planner(CoarseWorld(), num_samples=6, num_elites=3, num_proposals=2, scoring_dtype="bfloat16")
-    latent = planner.world_model.encode(torch.rand(2, planner.world_model.observation_dim))
-    returns = planner.imagined_returns(latent, torch.rand(2, 6, 3, planner.world_model.action_dim))
-    assert returns.dtype == torch.float32
-    assert not torch.equal(returns, returns.bfloat16().float())  # sums of its summands, and not rounded to it
+@pytest.mark.parametrize("score", [FinalScore(1.0), MeanScore(-1.0), AdaptiveScore(1.0)])
+def test_where_heads_agree_a_score_has_a_gradient(score):
+    returns = torch.full((2, 3, 2, 2), 5.0, requires_grad=True)
+    score(returns).sum().backward()
+    torch.testing.assert_close(returns.grad.sum((1, 2, 3)), torch.ones(2))
 
 
 def bmpc_return(model, observation, actions, discount) -> float:

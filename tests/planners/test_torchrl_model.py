@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv
-from torchrl.modules import WorldModel, WorldModelWrapper
+from torchrl.modules import RSSMPrior, WorldModel, WorldModelWrapper
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
 from torchrl_etdmpc.modules import require_prediction_model
@@ -142,6 +142,47 @@ def test_values_and_ends_are_those_that_are_given():
     model = make(wrapper(), values=lambda z: z, termination=lambda z: (z[..., 1] > 1).float())
     assert model.values(latent).shape == (2, 2)
     assert model.termination(latent).tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("make_imagined", [wrapper, Imagined])
+def test_a_state_that_the_model_only_reads_is_refused(make_imagined):
+    with pytest.raises(
+        ValueError, match=r"^the model does not write 'speed', at the root or below 'next'; it writes \["
+    ):
+        TorchRLModel(make_imagined(), action_dim=1, state_sizes={"place": 1, "speed": 1})
+    with pytest.raises(ValueError, match=r"^the model does not write 'gain', "):
+        make(wrapper(), reward_key="gain")
+
+
+def prior(*out_keys: str) -> WorldModelWrapper:
+    move = RSSMPrior(Bounded(-1, 1, (1,)), hidden_dim=8, rnn_hidden_dim=8, state_dim=2)
+    move(torch.zeros(1, 2), torch.zeros(1, 8), torch.zeros(1, 1))
+    return WorldModelWrapper(
+        TensorDictModule(move, in_keys=["state", "belief", "action"], out_keys=list(out_keys)),
+        TensorDictModule(lambda state: state.sum(-1, keepdim=True), in_keys=["state"], out_keys=["reward"]),
+    )
+
+
+def test_a_model_that_draws_is_refused_and_its_mean_is_not():
+    sizes: dict[str, int] = {"state": 2, "belief": 8}
+    before = torch.get_rng_state()
+    with pytest.raises(ValueError, match=r"^two steps of the model from one state differ in 'state': plans would be "):
+        TorchRLModel(prior("_mean", "_std", "state", "belief"), action_dim=1, state_sizes=sizes)
+    model = TorchRLModel(prior("state", "_std", "_sample", "belief"), action_dim=1, state_sizes=sizes)
+    latent, action = torch.randn(1, 5, 10), torch.rand(5, 1)
+    following = model.next(latent, action)
+    assert torch.equal(following, model.next(latent, action))
+    torch.testing.assert_close(model.reward(latent[0], action), following[0, :, :2].sum(-1))
+    dropout = nn.Sequential(nn.Linear(2, 1), nn.Dropout(0.5))
+    move = TensorDictModule(lambda x, action: dropout(torch.cat([x, action], -1)), ["x", "action"], ["x"])
+    inside = WorldModelWrapper(move, TensorDictModule(rewarded, in_keys=["x"], out_keys=["reward"]))
+    with pytest.raises(ValueError, match=r"differ in 'x': plans .* or call eval\(\) on dropout"):
+        TorchRLModel(inside, action_dim=1, state_sizes={"x": 1})
+    dropout.eval()
+    TorchRLModel(inside, action_dim=1, state_sizes={"x": 1})
+    torch.set_rng_state(before)
+    TorchRLModel(inside, action_dim=1, state_sizes={"x": 1})
+    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_what_is_no_model_of_torchrl_is_refused():

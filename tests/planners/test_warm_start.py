@@ -33,6 +33,12 @@ def test_the_first_candidates_are_drawn_around_the_shifted_previous_plan(make_pl
     torch.testing.assert_close(trace.actions[:, 0, 5:], drawn)
 
 
+@pytest.mark.parametrize("shape", [(3, 2, 2), (3, 3), (2, 3, 3), (2, 1, 3, 2)])
+def test_a_carried_plan_of_another_shape_is_refused_and_not_dealt_out_anew(make_planner, states, shape):
+    with pytest.raises(ValueError, match=r"^plan_mean must be \[\.\.\., H, A\], here \[2, 3, 2\], got \["):
+        make_planner(warm_start=True).plan(states(2), torch.zeros(shape, dtype=torch.float64))
+
+
 def test_the_carried_plan_is_the_mean_of_the_last_iteration(make_planner, states):
     plan = make_planner().plan(states(2), trace=True)
     assert torch.equal(plan.mean, plan.trace.mean[:, -1])

@@ -8,7 +8,13 @@ from torchrl_etdmpc.functional.gaussian import (
     gaussian_kl,
     tanh_log_slope,
 )
-from torchrl_etdmpc.functional.horizon import adaptive_mixture, ensemble_mean, ensemble_variance, lower_confidence_bound
+from torchrl_etdmpc.functional.horizon import (
+    adaptive_mixture,
+    ensemble_mean,
+    ensemble_std,
+    ensemble_variance,
+    lower_confidence_bound,
+)
 from torchrl_etdmpc.functional.mppi import (
     Elites,
     Gaussian,
@@ -36,6 +42,7 @@ __all__ = [
     "discount_from_episode_length",
     "elite_weights",
     "ensemble_mean",
+    "ensemble_std",
     "ensemble_variance",
     "fit_gaussian",
     "gaussian_entropy",

@@ -44,6 +44,25 @@ def ensemble_variance(returns: Tensor) -> Tensor:
     return deviation.square().sum((-2, -1)) / (members * (members - 1))
 
 
+def ensemble_std(returns: Tensor) -> Tensor:
+    """Standard deviation of the heads' mean, the root of :func:`ensemble_variance` (thesis Eq. 3.3).
+
+    Its gradient is 0, and not infinite, where all members agree, as new value heads do.
+
+    Args:
+        returns (Tensor): return estimates, shape ``[..., F, V]``.
+
+    Returns:
+        Tensor: shape ``[...]``; zero when M = 1.
+
+    >>> ensemble_std(torch.tensor([[1.0, 5.0]])).item()
+    2.0
+    """
+    variance = ensemble_variance(returns)
+    agree = variance == 0
+    return torch.where(agree, 0.0, torch.where(agree, 1.0, variance).sqrt())
+
+
 def lower_confidence_bound(returns: Tensor, beta: float) -> Tensor:
     """``mean - beta * sigma`` over the heads (thesis 3.4.3); beta < 0 is optimism.
 
@@ -58,7 +77,7 @@ def lower_confidence_bound(returns: Tensor, beta: float) -> Tensor:
     1.0
     """
     mean = ensemble_mean(returns)
-    return mean if beta == 0 else mean - beta * ensemble_variance(returns).sqrt()
+    return mean if beta == 0 else mean - beta * ensemble_std(returns)
 
 
 def adaptive_mixture(mean: Tensor, std: Tensor, beta: float) -> tuple[Tensor, Tensor]:

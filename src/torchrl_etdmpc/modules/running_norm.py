@@ -50,10 +50,11 @@ class RunningNorm(nn.Module):
 
         Args:
             rows (Tensor): ``[..., O]``.
-            counts (Tensor, optional): which rows count, bool, ``[...]``; a batch in which none does is none. Default:
-                all of them.
+            counts (Tensor, optional): which rows count, bool, ``[...]``; a batch in which none does is none, and so is
+                one that holds a row which is not finite. Default: all of them.
         """
-        self.batches.add_(1 if counts is None else counts.any())
+        finite = rows.to(self.mean.dtype).square().isfinite().all(-1)
+        self.batches.add_(finite.all() if counts is None else (finite | ~counts).all() & counts.any())
         rate = 1 / self.batches.to(self.mean.dtype)
         mean, variance = updated_moments(self.mean, self.variance, rows, rate, counts)
         self.mean.copy_(mean)

@@ -192,7 +192,13 @@ class WorldModel(nn.Module):
 
     def encode(self, observation: Any) -> Tensor:
         """Observation ``[..., O]``, or whatever the encoder takes with a leading batch, to latent ``[..., L]``."""
-        return self.encoder(observation)
+        latent = self.encoder(observation)
+        if latent.shape[-1:] != (self.latent_dim,):
+            raise ValueError(
+                f"the encoder must write latents [..., L], here L = latent_dim = {self.latent_dim}, got "
+                f"{list(latent.shape)}."
+            )
+        return latent
 
     def next(self, latent: Tensor, action: Tensor) -> Tensor:
         """Steps every dynamics head on its own latent.

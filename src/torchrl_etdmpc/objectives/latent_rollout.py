@@ -52,6 +52,12 @@ def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
     first = world_model.encode(slices.observation)
     with torch.no_grad():
         later = world_model.encode(slices.next_observation)
+    shape = *slices.action.shape[:2], world_model.latent_dim
+    if (first.shape, later.shape) != (shape[1:], shape):
+        raise ValueError(
+            "the encoder must keep every leading dimension of observations: of [B, ...] and [T, B, ...] it must make "
+            f"{list(shape[1:])} and {list(shape)}, got {list(first.shape)} and {list(later.shape)}."
+        )
     latents = [first.expand(world_model.num_dynamics, *first.shape)]
     for action in slices.action.unbind(0):
         latents.append(world_model.next(latents[-1], action))

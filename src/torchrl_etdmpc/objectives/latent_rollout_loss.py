@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 
-from torchrl_etdmpc.keys import ACTION, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
+from torchrl_etdmpc.keys import ACTION, DONE, LOC, NEXT, OBSERVATION, PLAN, REWARD, SCALE, TERMINATED
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.modules.new_weights import draw_new_weights
 from torchrl_etdmpc.objectives.latent_rollout import counted_mean, latent_rollout
@@ -113,6 +113,8 @@ class LatentRolloutLoss(SharedNetworksLoss):
             reward (NestedKey): read at ``("next", reward)``, ``[B, T, 1]``.
             terminated (NestedKey): read at ``("next", terminated)``, ``[B, T, 1]``, if there is a termination head;
                 without one it is looked at only to refuse termination.
+            done (NestedKey): looked at below ``"next"``, ``[B, T, 1]``, to refuse slices that join two episodes;
+                optional.
             plan_loc (NestedKey): mean of the planner's target, ``[B, T, A]``.
             plan_scale (NestedKey): standard deviation of the planner's target, ``[B, T, A]``; zeros for a step that has
                 no plan, and then trains everything but the policy.
@@ -125,6 +127,7 @@ class LatentRolloutLoss(SharedNetworksLoss):
         action: NestedKey = ACTION
         reward: NestedKey = REWARD
         terminated: NestedKey = TERMINATED
+        done: NestedKey = DONE
         plan_loc: NestedKey = (PLAN, LOC)
         plan_scale: NestedKey = (PLAN, SCALE)
         priority_weight: NestedKey = "priority_weight"
@@ -286,6 +289,7 @@ class LatentRolloutLoss(SharedNetworksLoss):
             weight_key=self.tensor_keys.priority_weight,
             use_weights=bool(self.use_prioritized_weights),  # or "auto": where there are some
             terminated_key=self._key("terminated") if refused else None,
+            done_key=unravel_key((NEXT, self.tensor_keys.done)),
         )
         return reader.read(tensordict, self._reads())
 

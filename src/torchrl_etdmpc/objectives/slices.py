@@ -76,6 +76,8 @@ class SliceReader:
     """Whether the weights count."""
     terminated_key: NestedKey | None = None
     """Where a step that terminates is refused. ``None``: nowhere."""
+    done_key: NestedKey = (NEXT, DONE)
+    """Where the ends of episodes are marked, behind which no step of a slice may count."""
 
     def read(self, tensordict: TensorDictBase, keys: Mapping[NestedKey, NestedKey]) -> Slices:
         """Reads a batch ``[B, T]``, time first.
@@ -200,19 +202,20 @@ class SliceReader:
         """Steps must follow each other, one at a time: what n-step returns and episodes side by side do not."""
         if torch.compiler.is_compiling():
             return
-        done, steps = tensordict.get((NEXT, DONE), None), tensordict.get("steps_to_next_obs", None)
+        steps = tensordict.get("steps_to_next_obs", None)
         if steps is not None and steps.device.type == "cpu" and (steps != 1).any():
             raise ValueError(
                 "'steps_to_next_obs' is not 1 everywhere: these losses learn single steps, and n-step rewards and "
                 "observations would be taken for those of one; leave MultiStep out, value_replayed=... has n-step "
                 "targets."
             )
+        done = tensordict.get(self.done_key, None)
         if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
             return
         inside = done.reshape(shape)[:, :-1].bool()
         if (inside if counts is None else inside & counts[:, 1:]).any():
             raise ValueError(
-                f"{(NEXT, DONE)!r} is True before the last step of a slice, so that another episode follows in it; "
+                f"{self.done_key!r} is True before the last step of a slice, so that another episode follows in it; "
                 "sample slices of one episode each (StepSliceSampler), or mask what follows (loss_mask_key)."
             )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 from weakref import ReferenceType, WeakKeyDictionary, ref
 
 from torch import Tensor, nn
@@ -61,7 +61,11 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
 def restart_count(world_model: nn.Module) -> None:
     """Takes a version that was loaded, not counted, as the one to go on from."""
     if world_model in _counts:
-        _counts[world_model].after = world_model.get_buffer("version").clone()
+        _counts[world_model].after = _version(world_model).clone()
+
+
+def _version(world_model: nn.Module) -> Tensor:
+    return cast(Tensor, world_model.version)  # get_buffer does not find it in one that torch.compile has wrapped
 
 
 @functools.cache
@@ -75,6 +79,6 @@ def _count(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) 
         counting = None if count.counts is None else count.counts()
         if place < len(count.trained) and (optimizer is counting or place <= count.place(counting)):
             count.counts = ref(optimizer)
-            version = world_model.get_buffer("version")
+            version = _version(world_model)
             version += version != count.after.to(version.device) + 1
             restart_count(world_model)

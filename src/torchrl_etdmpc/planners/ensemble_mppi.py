@@ -267,6 +267,8 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     def select_out_keys(self, *out_keys: NestedKey) -> EnsembleMPPIPlanner:
         """Leaves only some of the entries that :meth:`forward` writes.
 
+        Without the plan that is carried to the next step every plan starts cold, which is a warning.
+
         Raises:
             ValueError: if one of them is not written at all.
         """
@@ -274,6 +276,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         unknown = [key for key in keys if key not in self._written]
         if unknown:
             raise ValueError(f"out_keys must be some of {list(self._written)}, got {unknown}.")
+        if self.warm_start and self.next_plan_mean_key not in keys:
+            warnings.warn(
+                f"without {self.next_plan_mean_key!r} every plan starts cold; leave it among the out_keys, or make the "
+                "planner with warm_start=False.",
+                stacklevel=2,
+            )
         self.out_keys = keys  # pyright: ignore[reportAttributeAccessIssue]
         return self
 
@@ -468,13 +476,16 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             Plan: see its fields.
 
         Raises:
-            ValueError: if neither an observation nor a latent is given.
+            ValueError: if neither an observation nor a latent is given, or ``plan_mean`` has another shape.
         """
         if latent is None:
             if observation is None:
                 raise ValueError("plan needs an observation or a latent, got neither.")
             latent = self.world_model.encode(observation)
         batch = latent.shape[:-1]
+        carried = (*batch, self.horizon, self.world_model.action_dim)
+        if plan_mean is not None and plan_mean.shape != carried:
+            raise ValueError(f"plan_mean must be [..., H, A], here {list(carried)}, got {list(plan_mean.shape)}.")
         latent = latent.reshape(-1, latent.shape[-1])
         states = latent.shape[0]
         if noise is None:

@@ -14,7 +14,7 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 
 from torch import Tensor, nn
 
-from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance, lower_confidence_bound
+from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_std, lower_confidence_bound
 
 Depths = Literal["last", "all"]
 """How much of the return table a score reads."""
@@ -137,7 +137,7 @@ class AdaptiveScore:
             )
 
     def __call__(self, returns: Tensor) -> Tensor:
-        return adaptive_mixture(ensemble_mean(returns), ensemble_variance(returns).sqrt(), self.beta)[0]
+        return adaptive_mixture(ensemble_mean(returns), ensemble_std(returns), self.beta)[0]
 
 
 def _require_finite(beta: float) -> None:

@@ -15,14 +15,16 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import WorldModel
 
 from torchrl_etdmpc.keys import ACTION, NEXT, OBSERVATION, REWARD
+from torchrl_etdmpc.modules.prediction import device_and_dtype
 
 
 class TorchRLModel(nn.Module):
     """A TorchRL world model as a :class:`~torchrl_etdmpc.modules.PredictionModel`, without a policy.
 
-    The latent is what the model carries from step to step: its ``state_keys``, joined into one vector. Where the model
-    is probabilistic, its means are used. A reward costs a step of the model, so that a plan costs about two steps for
-    each of the candidates' actions.
+    The latent is what the model carries from step to step: its ``state_keys``, joined into one vector. Distributions
+    that are TensorDict modules (:class:`tensordict.nn.ProbabilisticTensorDictModule`) are rolled with their means; a
+    model that draws by itself is refused, because its candidates would be compared by luck. A reward costs a step of
+    the model, so that a plan costs about two steps for each of the candidates' actions.
 
     Args:
         model (nn.Module): an imagined environment (:class:`torchrl.envs.ModelBasedEnvBase`), or what steps in one: a
@@ -43,6 +45,7 @@ class TorchRLModel(nn.Module):
 
     Raises:
         TypeError: if the model is none of these.
+        ValueError: if it does not write a state or the reward, or two steps from one state differ.
 
     >>> from tensordict.nn import TensorDictModule
     >>> from torchrl.modules import WorldModelWrapper
@@ -94,6 +97,39 @@ class TorchRLModel(nn.Module):
         self.observation_key, self.action_key = unravel_key(observation_key), unravel_key(action_key)
         self.reward_key = unravel_key(reward_key)
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
+        self._require_written()
+        self._refuse_draws()
+
+    def _require_written(self) -> None:
+        """A state that the model only reads would stay as it is in every imagined step."""
+        steps = self.model
+        if isinstance(steps, ModelBasedEnvBase):
+            if type(steps)._step is not ModelBasedEnvBase._step:
+                return
+            steps = steps.world_model
+        written = [unravel_key(key) for key in steps.out_keys]
+        for key in (*self.state_sizes, self.reward_key):
+            if key not in written and unravel_key((NEXT, key)) not in written:
+                raise ValueError(
+                    f"the model does not write {key!r}, at the root or below 'next'; it writes {written}. Name what it "
+                    "writes in state_sizes and reward_key, or let it write a state that never changes as well."
+                )
+
+    def _refuse_draws(self) -> None:
+        device, dtype = device_and_dtype(self)
+        if device.type == "meta":
+            return
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
+            latent = torch.randn(1, 8, self.latent_dim, device=device, dtype=dtype)
+            action = torch.rand(8, self.action_dim, device=device, dtype=dtype) * 2 - 1
+            first, second = (self._step(latent, action) for _ in range(2))
+        for key in (*self.state_sizes, self.reward_key):
+            if not torch.allclose(first.get(key), second.get(key), rtol=1e-3, atol=1e-5, equal_nan=True):
+                raise ValueError(
+                    f"two steps of the model from one state differ in {key!r}: plans would be compared by luck. "
+                    "Take the mean of what it draws as the state (of RSSMPrior: out_keys=[the state, '_std', "
+                    "'_sample', the belief]), let a ProbabilisticTensorDictModule draw it, or call eval() on dropout."
+                )
 
     def encode(self, observation: Any) -> Tensor:
         """What the encoder takes, or the states themselves, to latent ``[..., L]``."""

@@ -43,7 +43,7 @@ def random_slices(
             ACTION: action,
             PLAN: dict(zip(TARGETS, fields, strict=True)),
             NEXT: {
-                OBSERVATION: observations[:, 1:],
+                OBSERVATION: observations[:, 1:].clone(),  # not the memory of the others
                 REWARD: torch.rand(num_slices, slice_len, 1),
                 TERMINATED: flags,
                 DONE: flags.clone(),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
+from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_std
 from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.inspector.studies.states import States, episode_interval
@@ -55,7 +55,7 @@ def horizon_weights(
         assert plan.trace is not None
         ranked = plan.trace.scores.where(plan.trace.scores.isfinite(), -torch.inf)
         elites = ranked.topk(searcher.num_elites, dim=-1).indices[..., None]
-        mean, sigma = ensemble_mean(plan.trace.returns), ensemble_variance(plan.trace.returns).sqrt()
+        mean, sigma = ensemble_mean(plan.trace.returns), ensemble_std(plan.trace.returns)
         mean, sigma = (part.gather(2, elites.expand(-1, -1, -1, horizon)) for part in (mean, sigma))  # [S, I, K, H]
         _, weights = adaptive_mixture(mean, sigma, float(beta))
         fields.append((weights.mean(2), mean[:, -1].mean(1), sigma[:, -1].mean(1)))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_etdmpc.functional import ensemble_variance
+from torchrl_etdmpc.functional import ensemble_std
 from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.components import components
 from torchrl_etdmpc.inspector.studies.replan import (
@@ -50,7 +50,7 @@ class LatentGallery(NamedTuple):
     @property
     def deviation(self) -> Tensor:
         """Standard deviation of the mean return estimate (thesis Eq. 3.3), which ``beta`` weighs, ``[S, b, H]``."""
-        return ensemble_variance(self.returns).sqrt()
+        return ensemble_std(self.returns)
 
     @property
     def error(self) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
+from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_std
 from torchrl_etdmpc.functional.horizon import SIGMA_FLOOR
 from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies.gradient_mixture import objective, projected_ascent, softmax_ascent
@@ -70,7 +70,7 @@ def solver(
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         assert plan.trace is not None
         returns = plan.trace.returns[:, -1].double()
-        rows.append(compare(ensemble_mean(returns), ensemble_variance(returns).sqrt(), beta, iterations))
+        rows.append(compare(ensemble_mean(returns), ensemble_std(returns), beta, iterations))
     stacked = (torch.stack(field) for field in zip(*rows, strict=True))
     candidates = len(states.observation) * planner.num_samples
     return Solved(*stacked, betas=tuple(map(float, betas)), iterations=tuple(iterations), candidates=candidates)

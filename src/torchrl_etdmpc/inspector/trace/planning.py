@@ -13,7 +13,7 @@ from torchrl_etdmpc.functional import (
     adaptive_mixture,
     elite_weights,
     ensemble_mean,
-    ensemble_variance,
+    ensemble_std,
     sample_elite,
     shift_plan,
 )
@@ -178,7 +178,7 @@ def _chosen(
 
 def _mixture(returns: Tensor, beta: float) -> Tensor:
     """Weights ``[I, N, D]`` that the adaptive score gives the depths."""
-    return adaptive_mixture(ensemble_mean(returns), ensemble_variance(returns).sqrt(), beta)[1]
+    return adaptive_mixture(ensemble_mean(returns), ensemble_std(returns), beta)[1]
 
 
 def _of_the_policy(planner: EnsembleMPPIPlanner, latent: Tensor) -> dict[str, Tensor]:
