@@ -43,6 +43,8 @@ from torchrl_etdmpc import (
     StepSliceSampler,
     WorldModel,
 )
+from torchrl_etdmpc.envs import get_task
+from torchrl_etdmpc.envs import make_env as make_task_env
 from torchrl_etdmpc.planners import FunctionScore
 
 TRAJ_KEY = ("collector", "traj_ids")
@@ -481,6 +483,29 @@ def test_a_reset_that_fails_costs_no_end_of_an_episode(insertion, num_envs):
         assert len(steps) == 3
         assert [row["next", "done"].item() for row in steps] == [False, False, True]
     assert collector.frames == num_envs * (12 - faults)
+
+
+def test_an_end_is_stored_where_the_reset_behind_it_fails_in_the_first_step_of_a_resumed_collector(monkeypatch):
+    gymnasium = pytest.importorskip("gymnasium")
+    task = get_task("gym/Pendulum-v1", episode_length=3)
+    first, resumed = (
+        StepCollector(make_task_env(task, seed=seed), RandomActions(), replay_buffer=make_replay()) for seed in (0, 1)
+    )
+    for _ in range(2):
+        first.step()
+    resumed.replay_buffer.extend(first.replay_buffer.storage[:])
+    resumed.load_state_dict(first.state_dict())
+    pendulum = gymnasium.make("Pendulum-v1").unwrapped
+
+    def fail(*args, **options):
+        raise RuntimeError("no answer")
+
+    monkeypatch.setattr(type(pendulum), "reset", fail)
+    for collector in (first, resumed):
+        with pytest.raises(SimulatorError, match="no answer"):
+            collector.step()
+        (steps,) = episodes(collector.replay_buffer.storage[:]).values()
+        assert [row["next", "done"].item() for row in steps] == [False, False, True]
 
 
 @pytest.mark.parametrize("chosen", [None, ExplorationType.DETERMINISTIC])

@@ -141,6 +141,25 @@ def test_the_state_that_a_seeded_reset_began_with_is_kept():
 
 
 @needs_gym
+def test_an_episode_whose_reset_fails_again_begins_afresh_and_is_no_error(monkeypatch):
+    env, other = (make_any_env("gym/Pendulum-v1", seed=0) for _ in range(2))
+    env.rollout(3)
+    reset = type(env._env.unwrapped).reset
+
+    def failing(self, **options):
+        reset(self, **options)  # after the random numbers are drawn
+        raise RuntimeError("no answer")
+
+    monkeypatch.setattr(type(env._env.unwrapped), "reset", failing)
+    with pytest.raises(RuntimeError, match="no answer"):
+        env.reset()
+    state = simulator_state(env)
+    load_simulator_state(other, state)  # whether it is there is the collector's to see
+    monkeypatch.undo()
+    assert other.reset()["observation"].isfinite().all()
+
+
+@needs_gym
 def test_a_simulator_of_gymnasium_that_behaves_otherwise_is_noticed():
     first, second = (make_any_env("gym/Pendulum-v1", seed=0) for _ in range(2))
     first.rollout(3)

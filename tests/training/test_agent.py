@@ -90,6 +90,13 @@ def test_every_setting_of_the_planner_arrives(tiny_config):
     assert planner.discount == 0.9
 
 
+def test_reanalyze_refuses_what_it_never_does(tiny_config):
+    with pytest.raises(
+        ValueError, match=r"^reanalyze\.eval_first_action has no effect, .*, got 'mean'; leave it out, or"
+    ):
+        build_agent(tiny_config(reanalyze={"eval_first_action": "mean"}), OBSERVATION_DIM, ACTION_DIM)
+
+
 @pytest.mark.parametrize(("name", "beta"), [("efficient-tdmpc-utd4", 0.0), ("humanoidbench", 10.0)])
 def test_the_paper_s_planners_are_built_from_its_presets_and_reanalyze_alone_is_pessimistic(tiny_config, name, beta):
     config = dataclasses.replace(preset(name), compile="off", model=tiny_config().model)

@@ -290,7 +290,15 @@ def test_what_goes_on_from_a_checkpoint_numbers_its_workers_on(started):
         ({"rows_per_batch": 0}, "rows_per_batch must be at least 1, got 0."),
         ({"send_every": 0}, "send_every must be at least 1, got 0."),
         ({"engine": "slurm"}, "engine must be one of multi, ray, got 'slurm'."),
-        ({"address": "auto"}, "address must be left out with engine=multi, got 'auto'; say engine=ray."),
+        ({"address": "auto"}, "address must be null with engine=multi, got 'auto'; say address=null or engine=ray."),
+        (
+            {"workers": 8, "rows_per_batch": 2, "replay": {"seed_decisions": 16}},
+            "replay.seed_decisions must be at least 24 with workers=8 whose batches (rows_per_batch=2) are shor",
+        ),
+        (
+            {"workers": 8, "rows_per_batch": 2, "replay": {"seed_decisions": 24, "capacity": 47}},
+            "replay.capacity must be at least 48 with workers=8 ",
+        ),
         ({"num_envs": 2}, "num_envs must be 1 with workers, got 2: each worker has one environment; raise workers."),
         ({"overlap": True}, "overlap must be false with workers, got true: workers step while the learner updates"),
         (

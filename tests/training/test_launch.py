@@ -25,6 +25,7 @@ from torchrl_etdmpc.training import (
     build_agent,
     launch,
     plan_launch,
+    preset,
     read_run_config,
     resumed_config,
     save_agent,
@@ -116,9 +117,21 @@ def test_a_run_that_made_no_step_is_begun_again_as_the_command_says(command, res
 
 
 @pytest.mark.parametrize("resume", ["on", "auto"])
+def test_a_run_that_made_no_step_has_its_settings_but_for_those_that_the_command_names(command, resume):
+    own = command(planner={"horizon": 4}, seed=3)
+    begin(own)
+    typed = {**preset("efficient-tdmpc").to_dict(), "run_dir": own.run_dir, "resume": resume, "total_env_steps": 500}
+    values = with_stored_settings(typed, ["run_dir", "resume", "total_env_steps"])
+    assert values == {**own.to_dict(), "resume": resume, "total_env_steps": 500}
+    # One that names what it trains means that, and not what was there.
+    assert with_stored_settings(typed, ["run_dir", "resume", "task"]) == typed
+    assert with_stored_settings({**typed, "resume": "off"}, ["run_dir", "resume"])["task"] == typed["task"]
+
+
+@pytest.mark.parametrize("resume", ["on", "auto"])
 def test_a_run_goes_on_from_its_checkpoint(command, resume):
     save(begin(command()))
-    assert plan(command(resume=resume)) == ("resume", command())
+    assert plan(command(resume=resume)) == ("resume", command(resume=resume))
 
 
 @pytest.mark.parametrize("resume", ["on", "auto"])
@@ -365,7 +378,7 @@ def test_a_damaged_configuration_is_taken_from_the_weights(command, tiny_config,
     elif how != "missing":
         directory.config.write_text(text.replace("horizon: 2", "horizon: 3") if how == "changed" else text[:-20])
     with pytest.warns(UserWarning, match=r"config\.yaml is .*; the settings are those of .*last\.pt\.$"):
-        assert plan(command(resume="on")) == ("resume", command())
+        assert plan(command(resume="on")) == ("resume", command(resume="on"))
     directory.last_agent.unlink()
     lost = "missing" if how == "missing" else "damaged"
     errors = {
@@ -395,7 +408,7 @@ def test_a_run_with_a_damaged_configuration_goes_on_and_has_it_back(command, pro
         launch(asked, ["total_env_steps"])
     assert directory.finished
     assert [row["env_steps"] for row in read_table(directory.eval)] == [0, 100, 140]
-    assert directory.read_config() == asked.to_dict() | {"resume": "off"}
+    assert directory.read_config() == asked.to_dict()
 
 
 class Killed(BaseException):

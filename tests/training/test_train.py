@@ -16,7 +16,7 @@ from torchrl.envs import Transform
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.collectors import NonFiniteError  # noqa: E402
+from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError  # noqa: E402
 from torchrl_etdmpc.envs import make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     EvaluationResult,
@@ -394,6 +394,18 @@ def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path, t
     assert rows["next", "done"].squeeze(-1)[:-1][ends].all()
     assert rows["next", "truncated"].sum() == rows["next", "done"].sum()
     assert read_table(tmp_path / "train.csv")[-1]["simulator_faults"] == 3
+
+
+def test_a_run_that_went_on_after_too_many_failures_has_as_many_new_ones(tmp_path, tiny_config, make_run):
+    config = tiny_config(max_faults=3)
+    run = make_run(config, tmp_path, Crash(33, 34, 35))
+    with pytest.warns(UserWarning, match=r"fresh episode \(failure \d\)"), pytest.raises(SimulatorError):
+        run.run()
+    run.log.directory.close()
+    with pytest.warns(UserWarning, match="fresh episode"):
+        resumed = make_run(config, tmp_path, Crash(3), resume=True)
+        assert resumed.run()["env_steps"] == 160
+    assert resumed.learner.faults == 4
 
 
 def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path, tiny_config, make_run, read_table):

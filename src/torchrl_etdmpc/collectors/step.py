@@ -216,7 +216,7 @@ class StepCollector(BaseCollector):
         kept = acted.exclude(*self.exclude_keys)
         values = (acted.get(key, None) for key in self._checked_after)
         finite = all(value is not None and bool(value.isfinite().all()) for value in values)
-        if finite and set(kept.keys(True, True)) == self._schema.get(self.in_seed_phase):
+        if finite and self._schema.get(self.in_seed_phase) in (None, set(kept.keys(True, True))):
             self._store(kept, acted.get(TRAJECTORY))
 
     def _act(self, tensordict: TensorDictBase, seeding: bool) -> TensorDictBase:

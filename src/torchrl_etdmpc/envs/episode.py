@@ -129,8 +129,8 @@ class RecordedEnv(EnvBase):
         if state is None:
             return
         self._set_random_state(state["random"])
-        self.restored = self._reset().get("observation"), False
         with contextlib.suppress(Exception):  # what failed there fails here, too, and a worker process must outlive it
+            self.restored = self._reset().get("observation"), False
             self.go_on(state["actions"])
 
     def go_on(self, actions: Tensor) -> None:

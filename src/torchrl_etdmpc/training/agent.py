@@ -159,6 +159,11 @@ def build_planner(
     3
     """
     schedule = ("every", "num_slices") if group == "reanalyze" else ()  # of ReanalyzeTransform
+    if schedule and config.eval_first_action != PlannerConfig.eval_first_action:
+        raise ValueError(
+            "reanalyze.eval_first_action has no effect, since plans are made anew as in training, got "
+            f"{config.eval_first_action!r}; leave it out, or set reanalyze.first_action."
+        )
     values = arguments(config, *schedule)
     if ":" in config.score:
         values["score"] = own_code(f"{group}.score", config.score)

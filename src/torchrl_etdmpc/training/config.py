@@ -243,7 +243,7 @@ class TrainConfig:
     eval_policy: bool = False
     """Whether evaluations also report the policy without the planner."""
     checkpoint_every: int = 50_000
-    """Environment steps between two checkpoints."""
+    """Environment steps between two checkpoints of learning; before it ``checkpoint_minutes`` counts alone."""
     log_every: int = 1_000
     """Environment steps between two rows of ``train.csv``."""
     checkpoint_minutes: float | None = 15.0

@@ -56,8 +56,19 @@ class DistributedConfig(TrainConfig):
                 raise ValueError(f"{name} must be {bound}, got {value}.")
         if self.address is not None and self.engine != "ray":
             raise ValueError(
-                f"address must be left out with engine={self.engine}, got {self.address!r}; say engine=ray."
+                f"address must be null with engine={self.engine}, got {self.address!r}; say address=null or engine=ray."
             )
+        # A worker whose batches are shorter than a slice may have sent one while the others have sent theirs.
+        apart = self.loss.slice_len * self.workers if self.rows_per_batch < self.loss.slice_len else 0
+        for name, number, least in (
+            ("replay.seed_decisions", self.seed_decisions, apart),
+            ("replay.capacity", self.replay.capacity, 2 * apart),
+        ):
+            if number < least:
+                raise ValueError(
+                    f"{name} must be at least {least} with workers={self.workers} whose batches (rows_per_batch="
+                    f"{self.rows_per_batch}) are shorter than a slice, got {number}."
+                )
         refused = {
             "num_envs": (self.num_envs, 1, "each worker has one environment; raise workers"),
             "overlap": (self.overlap, False, "workers step while the learner updates anyway"),

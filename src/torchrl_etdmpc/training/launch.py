@@ -93,7 +93,8 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
         return Launch(config, directory, "begin")
     stored = read_run_config(directory, type(config))
     # A directory that was moved or copied is where it is now.
-    merged = dataclasses.replace(resumed_config(stored, config, explicit), run_dir=config.run_dir)
+    here = {"run_dir": config.run_dir, "resume": config.resume}
+    merged = dataclasses.replace(resumed_config(stored, config, explicit), **here)
     if directory.finished and merged.total_env_steps <= stored.total_env_steps:
         return Launch(merged, directory, "nothing")
     made = CheckpointStore(directory.checkpoints).newest_step()
@@ -177,6 +178,7 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
         stack.callback(eval_env.close, raise_if_closed=False)
         log = RunLog(directory, total_env_steps=config.total_env_steps)
         run = TrainingRun(config, env=env, eval_env=eval_env, log=log, stop=stop)  # may find that settings are wrong
+        stack.callback(run.learner.collector.shutdown, raise_on_error=False)  # it may have begun a Ray cluster
         if plan.action == "begin":
             directory.begin(config.to_dict())
         else:
@@ -244,6 +246,9 @@ def with_stored_settings(
 ) -> dict[str, Any]:
     """The settings of a command that goes on with a run: what it does not name is the run's, not the preset's.
 
+    A run that was killed before it had anything to go on from is begun again, with its settings but for those that the
+    command names, or with the command's if that names a task or a preset.
+
     Args:
         values (mapping): the command's settings, not checked yet.
         explicit (iterable of str): those that it names.
@@ -260,8 +265,14 @@ def with_stored_settings(
     """
     directory, resume = _directory(values), values.get("resume", "off")
     resume = "off" if resume in (False, "false") else str(resume)
-    if not _says_its_settings(directory, resume) or resume == "off" or directory.leftover:
+    if not _says_its_settings(directory, resume) or resume == "off":
         return dict(values)
+    if directory.leftover:  # begun again: as the command says, if that says which run it means
+        if {"task", "preset"} & {*explicit}:
+            return dict(values)
+        told, wanted = flat(read_run_config(directory, kind).to_dict()), flat(values)
+        told |= {name: wanted[name] for name in explicit if name in wanted}
+        return {**_nested(told), "run_dir": values.get("run_dir")}
     stored = resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
     return {**stored, "run_dir": values.get("run_dir")}
 

@@ -128,6 +128,7 @@ class TrainingRun:
             self._pretrain()
             self._learn()
         except (NonFiniteError, SimulatorError):
+            self.learner.faults_in_a_row = 0  # a run that goes on from here has as many new tries
             self.checkpoints.save()
             raise
         finally:
