@@ -181,6 +181,16 @@ def test_only_the_worker_that_sent_rows_gets_weights_where_each_has_its_own(star
     learner.collector.shutdown()
 
 
+def test_a_run_that_cannot_begin_closes_the_cluster_that_it_began(tmp_path, monkeypatch):
+    closed = []
+    monkeypatch.setattr(RayConnection, "close", lambda self: closed.append(1))
+    monkeypatch.setattr(distributed, "RayCluster", lambda address, *, workers: RayConnection())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="cannot be written"):
+        launch(config_of(engine="ray", run_dir=str(tmp_path / "file" / "run")))
+    assert closed == [1]
+
+
 class RayConnection:
     def close(self) -> None:
         pass
