@@ -178,7 +178,7 @@ def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
         stack.callback(eval_env.close, raise_if_closed=False)
         log = RunLog(directory, total_env_steps=config.total_env_steps)
         run = TrainingRun(config, env=env, eval_env=eval_env, log=log, stop=stop)  # may find that settings are wrong
-        stack.callback(run.learner.collector.shutdown, raise_on_error=False)  # it may have begun a Ray cluster
+        stack.callback(lambda: run.learner.collector.shutdown(raise_on_error=False))  # it may have begun a Ray cluster
         if plan.action == "begin":
             directory.begin(config.to_dict())
         else:
