@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.directory import IN_USE
 from torchrl_etdmpc.runs.files import write_whole
 from torchrl_etdmpc.suites.attempt import BEGUN, FAILED, command, log_file
@@ -62,7 +63,7 @@ while :; do
         exit {code}
     fi
     tries=$((tries + 1))
-    steps=$(tail -n 1 "$(dirname "$log")/train.csv" 2> /dev/null | cut -d , -f 1)
+    steps=$(tail -n 1 "$(dirname "$log")/{table}" 2> /dev/null | cut -d , -f 1)
     if [ "$steps" -gt "$furthest" ] 2> /dev/null; then  # it got further than the tries before
         tries=0
         furthest=$steps
@@ -142,6 +143,7 @@ def write_slurm_script(
         failed=FAILED,
         in_use=IN_USE,
         pause=_LOOK_AGAIN_S,
+        table=RunDirectory(runs[0].path).train.name,
         retries=retries,
         code=EXIT_CODE,
     )
