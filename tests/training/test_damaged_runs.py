@@ -7,6 +7,8 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from torchrl_etdmpc.checkpoints import CheckpointError  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     RunInterrupted,
+    TrainingRun,
     load_agent,
     read_agent_file,
 )
@@ -123,21 +126,30 @@ def fill(disk: Path) -> None:
                 continue
 
 
+class Killed(BaseException):
+    pass
+
+
+def kill() -> None:
+    raise Killed
+
+
+def at_decisions(run: TrainingRun, happens: dict[int, Callable[[], None]]) -> None:
+    """Calls a function before the decision of that number."""
+    act, calls = run.learner.collector.act, count(1)
+
+    def watched(*args: Any) -> Any:
+        happens.get(next(calls), lambda: None)()
+        return act(*args)
+
+    run.learner.collector.act = watched
+
+
 def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight, small_config, make_run, results):
     config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    step, calls = run.learner.collector.act, [0]
-
-    def watched(*args: Any) -> Any:
-        calls[0] += 1
-        if calls[0] == 40:
-            fill(small_disk)
-        if calls[0] == 65:
-            (small_disk / "ballast").unlink()
-        return step(*args)
-
-    run.learner.collector.act = watched
+    at_decisions(run, {40: lambda: fill(small_disk), 65: (small_disk / "ballast").unlink})
     with pytest.warns(UserWarning) as warned:
         run.run()
     texts = [str(warning.message) for warning in warned]
@@ -154,20 +166,7 @@ def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(
     config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    step, calls = run.learner.collector.act, [0]
-
-    class Killed(BaseException):
-        pass
-
-    def watched(*args: Any) -> Any:
-        calls[0] += 1
-        if calls[0] == 40:
-            fill(small_disk)
-        if calls[0] == 55:
-            raise Killed
-        return step(*args)
-
-    run.learner.collector.act = watched
+    at_decisions(run, {40: lambda: fill(small_disk), 55: kill})
     with pytest.warns(UserWarning, match="no checkpoint at 90 env steps"), pytest.raises(Killed):
         run.run()
     run.log.directory.close()
@@ -182,15 +181,7 @@ def test_a_run_whose_end_cannot_be_saved_is_not_finished(small_disk, straight, s
     config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    step, calls = run.learner.collector.act, [0]
-
-    def watched(*args: Any) -> Any:
-        calls[0] += 1
-        if calls[0] == 50:
-            fill(small_disk)
-        return step(*args)
-
-    run.learner.collector.act = watched
+    at_decisions(run, {50: lambda: fill(small_disk)})
     expected = r"^run_dir=.* made its 140 env steps, but the end could not be saved \(No space left on device\), so "
     with pytest.warns(UserWarning), pytest.raises(OSError, match=expected):
         run.run()

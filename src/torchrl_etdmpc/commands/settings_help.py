@@ -15,7 +15,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from torchrl_etdmpc.training import TASK_SETTINGS
+from torchrl_etdmpc.training.config import typed_name
 
 _NAME_WIDTH = 34
 
@@ -76,7 +76,7 @@ def settings_of(config_class: type, prefix: str = "") -> dict[str, Setting]:
         if dataclasses.is_dataclass(hint):
             found |= settings_of(typing.cast(type, hint), f"{field.name}.")
             continue
-        name = f"task.{field.name}" if not prefix and field.name in TASK_SETTINGS else f"{prefix}{field.name}"
+        name = f"{prefix}{field.name}" if prefix else typed_name(field.name)
         meaning = meanings.get(field.name, "")
         for own_name in (f" ({name} on the command line)", f" ({name})"):
             meaning = meaning.replace(own_name, "")  # a docstring says it, where the name stands before it here

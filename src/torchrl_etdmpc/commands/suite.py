@@ -44,6 +44,7 @@ from torchrl_etdmpc.training import (
     config_from_dict,
     follow_own_code,
 )
+from torchrl_etdmpc.training.config import typed_name
 
 EXPERIMENTS = Path(__file__).parent / "config" / "experiments"
 _FILE, _LOCK = "experiment.yaml", ".experiment.lock"
@@ -292,7 +293,7 @@ def _of_each_variant(experiment: Experiment) -> list[dict[str, Any]]:
 
 def _of_all(told: Iterable[dict[str, Any]], name: str) -> Any:
     """A setting of a task for its import: the first one if every variant says its own, which then counts."""
-    values = [own.get(f"task.{name}", own.get(name)) for own in told]
+    values = [own.get(typed_name(name)) for own in told]
     return None if None in values else values[0]
 
 
@@ -311,7 +312,7 @@ def _read(arguments: list[str]) -> tuple[SuiteConfig, dict[str, Any]]:
         name, equals, text = argument.partition("=")
         if not equals:
             continue
-        name = f"task.{name}" if f"task.{name}" in training else name
+        name = typed_name(name)
         if not text and name in LEFT_OUT:  # of an unset variable of the shell
             raise ValueError(f"{name} must not be empty; leave it out for {LEFT_OUT[name]}.")
         if name in own:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 def updated_moments(
     mean: Tensor, variance: Tensor, rows: Tensor, rate: float | Tensor, counts: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Moves a running mean and variance towards those of some rows.
 
     What results are the moments of a mixture, ``1 - rate`` of what was seen before and ``rate`` of the rows: with
@@ -23,11 +23,11 @@ def updated_moments(
 
     Returns:
         tuple of Tensor: mean and variance, each ``[O]``, without gradient; the present ones where a row that counts is
-            not finite, or none counts.
+            not finite, or none counts. And whether they moved, a bool scalar.
 
-    >>> mean, variance = updated_moments(torch.zeros(1), torch.ones(1), torch.tensor([[2.0], [4.0]]), rate=0.5)
-    >>> mean.item(), variance.item()  # half of it at 0 with a variance of 1, half at 3 with a variance of 1
-    (1.5, 3.25)
+    >>> mean, variance, moved = updated_moments(torch.zeros(1), torch.ones(1), torch.tensor([[2.0], [4.0]]), rate=0.5)
+    >>> mean.item(), variance.item(), moved.item()  # half at 0 and half at 3, each with a variance of 1
+    (1.5, 3.25, True)
     """
     rows = rows.detach().reshape(-1, rows.shape[-1]).to(mean.dtype)
     if counts is None:
@@ -42,4 +42,4 @@ def updated_moments(
     within = (1 - rate) * variance + rate * rows_variance
     mixed = within + rate * (1 - rate) * apart.square()
     finite = mixed.isfinite().all()
-    return torch.where(finite, mean + rate * apart, mean), torch.where(finite, mixed, variance)
+    return torch.where(finite, mean + rate * apart, mean), torch.where(finite, mixed, variance), finite

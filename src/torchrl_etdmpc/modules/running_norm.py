@@ -53,10 +53,9 @@ class RunningNorm(nn.Module):
             counts (Tensor, optional): which rows count, bool, ``[...]``; a batch in which none does is none, and so is
                 one that holds a row which is not finite. Default: all of them.
         """
-        finite = rows.to(self.mean.dtype).square().isfinite().all(-1)
-        self.batches.add_(finite.all() if counts is None else (finite | ~counts).all() & counts.any())
-        rate = 1 / self.batches.to(self.mean.dtype)
-        mean, variance = updated_moments(self.mean, self.variance, rows, rate, counts)
+        rate = 1 / (self.batches + 1).to(self.mean.dtype)
+        mean, variance, moved = updated_moments(self.mean, self.variance, rows, rate, counts)
+        self.batches.add_(moved)
         self.mean.copy_(mean)
         self.variance.copy_(variance)
 

@@ -93,8 +93,8 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
         return Launch(config, directory, "begin")
     stored = read_run_config(directory, type(config))
     # A directory that was moved or copied is where it is now.
-    here = {"run_dir": config.run_dir, "resume": config.resume}
-    merged = dataclasses.replace(resumed_config(stored, config, explicit), **here)
+    merged = resumed_config(stored, config, explicit)
+    merged = dataclasses.replace(merged, run_dir=config.run_dir, resume=config.resume)
     if directory.finished and merged.total_env_steps <= stored.total_env_steps:
         return Launch(merged, directory, "nothing")
     made = CheckpointStore(directory.checkpoints).newest_step()
