@@ -123,6 +123,10 @@ def test_the_budget_may_be_the_benchmark_s_and_the_base_is_read(tmp_path):
     assert found.base == "b"
 
 
+def test_a_base_that_is_not_named_is_the_first_variant(tmp_path):
+    assert read_experiment(plan(tmp_path, variants=["b", "a"], base=None)).base == "b"
+
+
 def test_a_variant_may_have_a_budget_of_its_own(tmp_path):
     variants = {"a": {}, "short": {"total_env_steps": 100}}
     root = plan(tmp_path, budget=200, variants=variants, seeds=[1])

@@ -59,12 +59,13 @@ def test_settings_of_the_task_are_one_setting_however_they_are_spelled(write, tm
     repeats = {name: {"task": {"action_repeat": 4}} if spelling == "nested" else {spelling: 4} for name in "ab"}
     for own in ("action_repeat", "task.action_repeat"):
         file = write(variants=repeats, settings={"preset": "cpu", own: 2}, base=None)
-        for changes, expected in (({}, 4), ({"settings": {"task.action_repeat": 1}}, 1)):
-            runs = read_experiment(file, **changes).runs(tmp_path)
+        for changes, expected in (({}, 4), ({"task.action_repeat": 1}, 1), ({"action_repeat": 1}, 1)):
+            runs = read_experiment(file, settings=changes).runs(tmp_path)
             assert {run.config.action_repeat for run in runs} == {expected}
-    search = {"search": {"action_repeat": [1, 2]}, "trials": 2}
-    with pytest.raises(ValueError, match=r"searches task\.action_repeat, which is given as well"):
-        read_experiment(write(variants={"tuned": search | {"task.action_repeat": 4}}, base=None))
+    for searched, given in (("action_repeat", "task.action_repeat"), ("task.action_repeat", "action_repeat")):
+        variants = {"tuned": {"search": {searched: [1, 2]}, "trials": 2, given: 4}}
+        with pytest.raises(ValueError, match=r"searches task\.action_repeat, which is given as well"):
+            read_experiment(write(variants=variants, base=None))
 
 
 def test_a_setting_of_the_task_under_both_of_its_names_is_refused(write):

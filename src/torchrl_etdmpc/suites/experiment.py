@@ -212,7 +212,7 @@ class Experiment:
         return self._config(variant, self.variants[variant], task, seed)
 
     def _config(self, variant: str, own: Mapping[str, Any], task: str, seed: int) -> TrainConfig:
-        settings = _spelled(self.settings) | _spelled(own)
+        settings = {**self.settings, **own}
         try:
             name = settings.pop("preset", "efficient-tdmpc")
             _require(isinstance(name, str), f"preset must be a name, got {name!r}.")
