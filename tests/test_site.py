@@ -75,6 +75,19 @@ def test_the_names_of_torchrl_that_have_a_page_exist_in_it():
         assert page.endswith(f"/{name}.html")
 
 
+def test_what_docstrings_refer_to_in_full_has_an_entry(generate):
+    entries = (DOCS / "inventories" / "torchrl.txt").read_text(encoding="utf-8").splitlines()[3:]
+    known = {entry.split()[0] for entry in entries} | {f"torchrl_etdmpc.{room}" for room in generate.ROOMS}
+    known |= {f"torchrl_etdmpc.{room}.{name}" for room in generate.ROOMS for name in generate.public_names(room)}
+    things = [thing for room in generate.ROOMS for _, thing in documented(generate, room)]
+    parts = [part for thing in things if inspect.isclass(thing) for part in vars(thing).values()]
+    texts = "".join(thing.__doc__ or "" for thing in (*things, *filter(inspect.isroutine, parts)))
+    targets = set(re.findall(r":(?:class|func|meth|mod|obj|data|exc|attr):`~?([a-z]\w*\.[\w.]+)`", texts))
+    assert "torchrl_etdmpc.modules.PredictionModel" in targets
+    # A method's entry is below its class.
+    assert {target for target in targets if not {target, target.rpartition(".")[0]} & known} == set()
+
+
 def test_the_equations_name_functions_and_tests_that_exist(generate):
     for equation in generate.EQUATIONS:
         module, _, name = equation.function.rpartition(".")

@@ -22,9 +22,9 @@ class TorchRLModel(nn.Module):
     """A TorchRL world model as a :class:`~torchrl_etdmpc.modules.PredictionModel`, without a policy.
 
     The latent is what the model carries from step to step: its ``state_keys``, joined into one vector. Distributions
-    that are TensorDict modules (:class:`tensordict.nn.ProbabilisticTensorDictModule`) are rolled with their means; a
-    model that draws by itself is refused, because its candidates would be compared by luck. A reward costs a step of
-    the model, so that a plan costs about two steps for each of the candidates' actions.
+    that are TensorDict modules (``ProbabilisticTensorDictModule``) are rolled with their means; a model that draws by
+    itself is refused, because its candidates would be compared by luck. A reward costs a step of the model, so that a
+    plan costs about two steps for each of the candidates' actions.
 
     Args:
         model (nn.Module): an imagined environment (:class:`torchrl.envs.ModelBasedEnvBase`), or what steps in one: a
