@@ -298,7 +298,7 @@ def test_a_public_name_without_a_docstring_is_noticed(generate, monkeypatch):
     ("file", "old", "new", "said"),
     [
         (
-            "docs/tutorials/04_your_own_objective.py",
+            "docs/tutorials/04_your_own_score.py",
             "def cautious(",
             "raise RuntimeError\n\n\ndef cautious(",
             "04_your",

@@ -7,9 +7,9 @@ standard deviation. This page looks at one decision in slow motion.
 """
 
 # %%
-# One decision, two objectives
-# ----------------------------
-# The world is the one of the tutorial on objectives: one of four heads believes in a bonus for actions between 0.2
+# One decision, two scores
+# ------------------------
+# The world is the one of the tutorial on scores: one of four heads believes in a bonus for actions between 0.2
 # and 0.6, and the goal lies the other way.
 
 import matplotlib.pyplot as plt

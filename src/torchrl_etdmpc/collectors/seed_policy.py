@@ -1,4 +1,4 @@
-"""The policy of the seed phase: uniform actions, with the planner's whole schema."""
+"""The policy of the random phase: uniform actions, with the planner's whole schema."""
 
 from __future__ import annotations
 

@@ -45,8 +45,8 @@ class StepCollector(BaseCollector):
     Keyword Args:
         replay_buffer (ReplayBuffer): where transitions go.
         total_frames (int): decisions to make, all environments together; -1 for no end. Default: -1.
-        init_random_frames (int): length of the seed phase in decisions, all environments together. Default: 0.
-        seed_policy (nn.Module, optional): acts in the seed phase; it must write what ``policy`` writes and
+        init_random_frames (int): length of the random phase in decisions, all environments together. Default: 0.
+        seed_policy (nn.Module, optional): acts in the random phase; it must write what ``policy`` writes and
             the buffer keeps, e.g. :class:`SeedPolicy`. Required if ``init_random_frames`` is positive.
         insertion (str): ``"step"`` or ``"episode"``. Default: ``"step"``.
         exclude_keys (sequence of NestedKey): what not to store. Default: the warm start, ``"plan_mean"`` and
@@ -141,7 +141,7 @@ class StepCollector(BaseCollector):
 
     @property
     def in_seed_phase(self) -> bool:
-        """Whether the next decision belongs to the seed phase."""
+        """Whether the next decision belongs to the random phase."""
         return self._frames < self.init_random_frames
 
     def iterator(self) -> Iterator[TensorDictBase]:
@@ -341,7 +341,7 @@ class StepCollector(BaseCollector):
             return None
 
     def state_dict(self) -> OrderedDict:
-        """Counters, the place in the running episodes, the simulator's included, and in the seed phase its policy's.
+        """Counters, the place in the running episodes, the simulator's included, and in the random phase its policy's.
 
         Not the policy's weights. Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)``
         reads them.

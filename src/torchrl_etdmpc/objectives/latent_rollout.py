@@ -30,7 +30,7 @@ class LatentRollout(NamedTuple):
 
 
 def latent_rollout(world_model: WorldModel, slices: Slices) -> LatentRollout:
-    """Encodes every observation and rolls every dynamics head from the first one (spec of BMPC; thesis appendix B).
+    """Encodes every observation and rolls every dynamics head from the first one (BMPC; thesis appendix B).
 
     ``zhat_{0,i} = h(s_0)`` with gradient into the encoder, ``zhat_{k+1,i} = f_i(zhat_{k,i}, a_k)``; the encodings of
     the later observations carry no gradient.

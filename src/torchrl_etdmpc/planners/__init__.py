@@ -1,4 +1,4 @@
-"""Planners, their objectives, and the imagined environment that they plan in."""
+"""Planners, their scores, and the imagined environment that they plan in."""
 
 from torchrl_etdmpc.planners.arguments import FirstAction, InitialPlan, ScoringDtype
 from torchrl_etdmpc.planners.bare_policy import BarePolicy

@@ -1,4 +1,4 @@
-"""Planner objectives: how the table of return estimates becomes the score of a candidate.
+"""Scores, the planner's objectives: how the table of return estimates becomes the score of a candidate.
 
 A score is any callable from ``[..., D, F, V]`` (depth, dynamics head, value head) to ``[...]``. D is the horizon, or 1
 for a score whose attribute ``depths`` is ``"last"``: the planner then computes values at the last depth only. A plain

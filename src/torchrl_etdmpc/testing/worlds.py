@@ -1,7 +1,7 @@
 """Analytic worlds: exact functions in the place of the learned networks, so that the best plan is known.
 
-Each is a :class:`~torchrl_etdmpc.modules.PredictionModel`, so ``LatentEnv(LineWorld())`` drives a planner, and an
-objective of one's own can be held against the optimum.
+Each is a :class:`~torchrl_etdmpc.modules.PredictionModel`, so ``LatentEnv(LineWorld())`` drives a planner, and a
+score of one's own can be held against the optimum.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Budget and objective of one planner; see :class:`~torchrl_etdmpc.planners.EnsembleMPPIPlanner`."""
+    """Budget and score of one planner; see :class:`~torchrl_etdmpc.planners.EnsembleMPPIPlanner`."""
 
     horizon: int = 6
     num_samples: int = 512
@@ -344,7 +344,7 @@ class TrainConfig:
 
     @property
     def seed_decisions(self) -> int:
-        """Length of the random phase in decisions (spec: max(1000, 5 episodes))."""
+        """Length of the random phase in decisions (default: max(1000, 5 episodes))."""
         if self.replay.seed_decisions is not None:
             return self.replay.seed_decisions
         return max(1000, 5 * self.task_spec.decision_steps_per_episode)

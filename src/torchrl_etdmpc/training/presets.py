@@ -88,7 +88,7 @@ PRESETS: dict[str, TrainConfig] = {
             # count alike. Values of a small model keep themselves up, and plans of few candidates are sharp by chance
             # (docs/studies/stability.md).
             loss=LossConfig(tau=0.1, value_replayed=0.5, value_expectile=0.7, kl_direction="forward"),
-            # Departure from BMPC and the thesis, which pretrain with as many updates as the seed phase had decisions:
+            # Departure from BMPC and the thesis, which pretrain with as many updates as the random phase had decisions:
             # 1,000 for its 2,500, for the time that a CPU takes.
             replay=ReplayConfig(pretrain_updates=1000),
         ),

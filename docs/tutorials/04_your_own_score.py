@@ -1,10 +1,10 @@
 """
-A planner objective of your own
-===============================
+A score of your own
+===================
 
-The planner scores a candidate by a function of its table of return estimates. You can pass a function of yours. To
-compare objectives, plan with each from the same states, with the same random numbers, and judge the plans by a world
-that is known.
+The planner scores a candidate by a function of its table of return estimates: the thesis calls it the planner's
+objective. You can pass a function of yours. To compare scores, plan with each from the same states, with the same
+random numbers, and judge the plans by a world that is known.
 """
 
 # %%
@@ -23,8 +23,8 @@ believed = LineWorld(goal=-1.0, num_dynamics=4, trap=(0.2, 0.6), trap_bonus=20.0
 truth = LineWorld(goal=-1.0)
 
 # %%
-# Objectives are functions
-# ------------------------
+# Scores are functions
+# --------------------
 # The table is ``[..., D, F, V]``: depth, dynamics head, value head. A score reduces it to ``[...]``. Here are two of
 # your own.
 
@@ -52,7 +52,7 @@ scores = {
 # %%
 # The same states, the same draws
 # -------------------------------
-# ``draw_noise`` draws every random number of a planning call. With the same ones, two plans differ by the objective
+# ``draw_noise`` draws every random number of a planning call. With the same ones, two plans differ by the score
 # alone.
 
 budget = dict(horizon=3, num_samples=128, num_elites=16, num_proposals=0, iterations=6, warm_start=False)
@@ -68,7 +68,7 @@ for name, score in scores.items():
     latent = truth.encode(states)
     costs[name] = (truth.reward(latent, optimum) - truth.reward(latent, action)).mean().item()
 
-print(f"{'objective':18} {'in the trap':>12} {'reward lost per step':>22}")
+print(f"{'score':18} {'in the trap':>12} {'reward lost per step':>22}")
 for name in scores:
     print(f"{name:18} {trapped[name]:12.0%} {costs[name]:22.3f}")
 
