@@ -170,7 +170,8 @@ def write_readme(table: pd.DataFrame) -> None:
         "What `python benchmarks/cpu_learning.py` makes: runs of `benchmarks/experiments/cpu-all.yaml`, two at a time,",
         "one thread each, with other work beside. Returns are means of evaluations (10 episodes, planner without",
         "noise) and in brackets those of each seed; minutes include random phase, compilation, evaluations and pauses,",
-        "ms per decision pauses too: runs far above the others waited while something else was timed.",
+        "ms per decision pauses too: runs far above the others waited while something else was timed. A plan of the",
+        "humanoids and dogs, whose actions have more than 20 dimensions, has five iterations, of the others three.",
         "Tasks that are missing, and missing seeds of three, are not run yet.",
         "",
         f"The preset's settings were chosen on {', '.join(TASKS[:-1])} and {TASKS[-1]}, with these",
@@ -200,7 +201,8 @@ def write_readme(table: pd.DataFrame) -> None:
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + ".", ""]
     lines += [
         "Beside published curves: [means](../../../docs/results.md#what-the-cpu-preset-is-worth),",
-        "[the six tasks that it was tuned on](report/index.md), [easy tasks](report-easy/index.md).",
+        "[the six tasks that it was tuned on](report/index.md), [easy tasks](report-easy/index.md),",
+        "[hard tasks](report-hard/index.md).",
         "With the preset's former settings:",
         "[values that were imagined alone](imagined/README.md), [with 101 bins too](bins-101/README.md),",
         "[at half the width](width-64/README.md).",
