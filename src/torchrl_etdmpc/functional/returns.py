@@ -90,10 +90,10 @@ def discount_from_episode_length(
 ) -> float:
     """Discount heuristic of TD-MPC2 (arXiv:2310.16828, appendix; thesis Table A.1).
 
-    ``clip((T / 5 - 1) / (T / 5), discount_min, discount_max)`` with T the episode length in decision steps.
+    ``clip((E / 5 - 1) / (E / 5), discount_min, discount_max)`` with E the episode length in decision steps.
 
     Args:
-        decision_steps (float): episode length T in decision steps, positive; infinite without a time limit.
+        decision_steps (float): episode length E in decision steps, positive; infinite without a time limit.
         discount_min (float): lower bound.
         discount_max (float): upper bound.
         denominator (float): the 5 of the formula.
