@@ -32,7 +32,7 @@ class WorldModel(nn.Module):
         latent_dim (int): L, a multiple of ``simnorm_dim``.
         mlp_dim (int): hidden size of dynamics, reward, value, policy and termination.
         encoder_dim (int): hidden size of the encoder.
-        encoder_layers (int): hidden layers of the encoder.
+        encoder_layers (int): hidden layers of the encoder; thesis Table A.1 counts the output layer too.
         num_dynamics (int): F, dynamics heads.
         num_values (int): V, value heads.
         simnorm_dim (int): group size of SimNorm.
