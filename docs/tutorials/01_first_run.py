@@ -2,16 +2,17 @@
 First run and its curves
 ========================
 
-A run is a configuration and a folder. This page trains Gymnasium's Pendulum for 1,200 steps, which is a minute of
-simulated time, and reads what the run wrote.
+A run is a configuration and a folder. This page trains Gymnasium's Pendulum for 1,000 steps, which is less than a
+minute of simulated time, and reads what the run wrote.
 """
 
 # %%
 # The configuration
 # -----------------
 # A preset holds every setting; what you change is replaced in it. ``preset("cpu")`` has the parts of the method at a
-# size that one core learns with, and some settings of its own. On the command line the same is
-# ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu total_env_steps=1200 ...``.
+# size that one core learns with, and some settings of its own; here networks and planners are smaller still, so that
+# the page is built quickly. On the command line the same is
+# ``torchrl-etdmpc train task=gym/Pendulum-v1 preset=cpu total_env_steps=1000 model.mlp_dim=64 ...``.
 
 import tempfile
 from dataclasses import replace
@@ -27,12 +28,15 @@ small = preset("cpu")
 config = replace(
     small,
     task="gym/Pendulum-v1",
-    total_env_steps=1_200,
-    eval_every=400,
+    total_env_steps=1_000,
+    eval_every=500,
     eval_episodes=3,
-    log_every=100,
+    log_every=50,
     run_dir=str(run_dir),
     compile="off",
+    model=replace(small.model, latent_dim=64, mlp_dim=64, encoder_dim=64),
+    planner=replace(small.planner, num_samples=24, num_elites=3, num_proposals=2, iterations=2),
+    reanalyze=replace(small.reanalyze, num_slices=5, iterations=2),
     replay=replace(small.replay, seed_decisions=400, pretrain_updates=200),
 )
 
