@@ -88,11 +88,11 @@ check_env(make_env(task, seed=0))
 # those of ``efficient-tdmpc``; ``dataclasses.replace(preset("cpu"), ...)`` begins with those of ``cpu``.
 
 run_dir = Path(tempfile.mkdtemp()) / "track"
-planner = {"horizon": 3, "num_samples": 32, "num_elites": 6, "num_proposals": 2, "iterations": 3}
+planner = {"horizon": 3, "num_samples": 24, "num_elites": 4, "num_proposals": 2, "iterations": 2}
 config = TrainConfig.from_dict(
     {
-        **{"task": "track", "total_env_steps": 900, "run_dir": str(run_dir)},
-        **{"eval_every": 300, "eval_episodes": 5, "log_every": 100, "compile": "off", "threads": 1},
+        **{"task": "track", "total_env_steps": 700, "run_dir": str(run_dir)},
+        **{"eval_every": 350, "eval_episodes": 3, "log_every": 100, "compile": "off", "threads": 1},
         "model": {"latent_dim": 32, "mlp_dim": 64, "encoder_dim": 64, "num_dynamics": 2},
         "planner": planner,
         "reanalyze": {**planner, "num_slices": 4},
