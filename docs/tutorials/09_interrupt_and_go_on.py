@@ -32,11 +32,11 @@ def config(name, **changes):
     return TrainConfig.from_dict(
         {
             "task": "gym/Pendulum-v1",
-            "total_env_steps": 500,
-            "eval_every": 250,
-            "eval_episodes": 2,
-            "log_every": 50,
-            "checkpoint_every": 150,
+            "total_env_steps": 400,
+            "eval_every": 200,
+            "eval_episodes": 1,
+            "log_every": 25,
+            "checkpoint_every": 100,
             "compile": "off",
             "threads": 1,
             "run_dir": str(folder / name),
@@ -44,7 +44,7 @@ def config(name, **changes):
             "planner": planner,
             "reanalyze": {**planner, "every": 10, "num_slices": 2},
             "optim": {"batch_size": 32, "lr": 1e-3},
-            "replay": {"seed_decisions": 250, "pretrain_updates": 20},
+            "replay": {"seed_decisions": 200, "pretrain_updates": 20},
         }
         | changes
     )
