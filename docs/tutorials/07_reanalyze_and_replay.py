@@ -33,7 +33,7 @@ from torchrl_etdmpc.training import Updater
 budget = dict(horizon=3, num_samples=24, num_elites=6, num_proposals=2, iterations=3, discount=0.97)
 
 
-def experiment(interval, insertion="step"):
+def experiment(interval):
     torch.manual_seed(0)
     env = make_env("gym/Pendulum-v1", seed=0)
     world_model = WorldModel(3, 1, latent_dim=32, mlp_dim=64, num_dynamics=2)
@@ -55,19 +55,17 @@ def experiment(interval, insertion="step"):
         total_frames=360,
         init_random_frames=60,
         seed_policy=SeedPolicy(env.action_spec),
-        insertion=insertion,
     )
-    steps, ages, waiting = [], [], []
+    steps, ages = [], []
     for frame, _ in enumerate(collector, 1):
-        waiting.append(frame - len(buffer))
-        if frame <= 60 or not len(buffer):
+        if frame <= 60:
             continue
         updater.step(buffer.sample())
         if frame % 20 == 0:
             rows = buffer.storage[:]
             steps.append(frame - 60)
             ages.append((world_model.version - rows["plan", "version"]).float().mean().item())
-    return buffer.storage[:], world_model, fresh, (steps, ages), waiting
+    return buffer.storage[:], world_model, fresh, (steps, ages)
 
 
 results = {interval: experiment(interval) for interval in (0, 20, 5)}
@@ -79,7 +77,7 @@ results = {interval: experiment(interval) for interval in (0, 20, 5)}
 # it, growth is slower; it stops only where as many plans are made anew as become old.
 
 figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-for interval, (_, _, _, (steps, ages), _) in results.items():
+for interval, (_, _, _, (steps, ages)) in results.items():
     axis.plot(steps, ages, marker=".", label=f"every {interval} updates" if interval else "never")
 axis.set(xlabel="updates", ylabel="mean age of the stored plans, updates")
 axis.legend(title="reanalyze")
@@ -102,8 +100,8 @@ def staleness(rows, world_model, fresh):
     return (world_model.version - rows["plan", "version"]).squeeze(-1), kl, floor
 
 
-rows, world_model, fresh, _, _ = results[20]
-age, kl, floor = staleness(rows, world_model, fresh)
+stale = {interval: staleness(*made) for interval, (*made, _) in results.items()}
+age, kl, floor = stale[20]
 planned = age < 300  # without the random phase, whose plans are N(0, 1)
 edges = torch.arange(0, 301, 30)
 middles, medians = [], []
@@ -121,8 +119,7 @@ plt.show()
 
 # %%
 print(f"{'reanalyze':12} {'mean age':>9} {'median KL of stored plans':>27} {'of fresh ones':>14}")
-for interval, (rows, world_model, fresh, _, _) in results.items():
-    age, kl, floor = staleness(rows, world_model, fresh)
+for interval, (age, kl, floor) in stale.items():
     chosen = age < 300
     name = f"every {interval}" if interval else "never"
     print(f"{name:12} {age.float().mean():9.0f} {kl[chosen].median():27.2f} {floor.median():14.2f}")
@@ -133,12 +130,20 @@ for interval, (rows, world_model, fresh, _, _) in results.items():
 # Per step or per episode
 # -----------------------
 # With ``insertion="step"`` a transition can be sampled before the next action is chosen. With ``"episode"`` it waits
-# until its episode has ended, as in BMPC.
+# until its episode has ended, as in BMPC. Random actions will do to see it.
 
-_, _, _, _, per_episode = experiment(0, insertion="episode")
+
+def waiting(insertion):
+    env = make_env("gym/Pendulum-v1", seed=0)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000))
+    policy = SeedPolicy(env.action_spec)
+    collector = StepCollector(env, policy, replay_buffer=buffer, total_frames=360, insertion=insertion)
+    return [frame - len(buffer) for frame, _ in enumerate(collector, 1)]
+
+
 figure, axis = plt.subplots(figsize=(7, 2.8), layout="constrained")
-axis.plot(results[0][4], label='insertion="step"')
-axis.plot(per_episode, label='insertion="episode"')
+for insertion in ("step", "episode"):
+    axis.plot(waiting(insertion), label=f'insertion="{insertion}"')
 axis.set(xlabel="decision", ylabel="transitions that\ncannot be sampled yet")
 axis.legend()
 plt.show()
