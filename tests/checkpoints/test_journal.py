@@ -8,7 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRoundRobinWriter
+from torchrl.data import (
+    LazyTensorStorage,
+    ListStorage,
+    TensorDictMaxValueWriter,
+    TensorDictReplayBuffer,
+    TensorDictRoundRobinWriter,
+)
 
 from torchrl_etdmpc.checkpoints import ReplayJournal
 from torchrl_etdmpc.checkpoints import journal as module
@@ -119,6 +125,70 @@ def test_older_states_stay_loadable_until_they_are_pruned(tmp_path):
     assert_same(run.buffer, copy)
     with pytest.raises(DamagedFileError):
         ReplayJournal(tmp_path).load(make_buffer(30), states[0][0])
+
+
+@pytest.mark.parametrize("count", [0, 1, 9, 10, 11, 25, 60])
+def test_a_buffer_that_was_emptied_is_saved_as_it_is_now(tmp_path, count):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10)
+    journal.save(run.buffer, version=run.version)
+    run.buffer.empty()
+    if count:
+        run.write(count)
+        run.refresh(3)
+    files = journal.save(run.buffer, version=run.version)
+    copy = make_buffer()
+    ReplayJournal(tmp_path).load(copy, files)
+    assert len(copy) == min(count, 50)
+    assert not count or (copy.storage[:] == run.buffer.storage[:]).all()
+
+
+def test_a_loaded_buffer_that_is_emptied_is_saved_as_it_is_then(tmp_path):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10)
+    files = journal.save(run.buffer)
+    run.buffer, journal = make_buffer(), ReplayJournal(tmp_path)
+    journal.load(run.buffer, files)
+    run.buffer.empty()
+    run.write(15)
+    copy = make_buffer()
+    ReplayJournal(tmp_path).load(copy, journal.save(run.buffer))
+    assert (copy.storage[:] == run.buffer.storage[:]).all()
+
+
+def test_a_last_row_that_becomes_the_end_of_its_episode_is_still_the_same_row(tmp_path):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10)
+    run.buffer.storage[:]["observation"][9, 0] = float("nan")
+    kept = journal.save(run.buffer)["rows"]
+    run.buffer.storage[:]["next", "done"][9] = True
+    run.write(1)
+    assert journal.save(run.buffer)["rows"][: len(kept)] == kept
+
+
+@pytest.mark.parametrize(
+    ("storage", "writer"),
+    [
+        (LazyTensorStorage(20, ndim=2), TensorDictRoundRobinWriter()),
+        (ListStorage(20), TensorDictRoundRobinWriter()),
+        (LazyTensorStorage(20), TensorDictMaxValueWriter(rank_key="number")),
+    ],
+)
+def test_a_buffer_that_is_no_ring_of_rows_is_refused(tmp_path, storage, writer):
+    buffer = TensorDictReplayBuffer(storage=storage, writer=writer, batch_size=4)
+    rows = TensorDict({"number": torch.arange(16)}, [16])
+    buffer.extend(rows.reshape(2, 8) if storage.ndim > 1 else rows)
+    with pytest.raises(TypeError, match="cannot be saved row by row; use LazyTensorStorage"):
+        ReplayJournal(tmp_path).save(buffer)
+
+
+def test_a_write_count_that_is_not_the_buffer_s_is_refused(tmp_path):
+    run = Pipeline(make_buffer())
+    run.write(10)
+    run.buffer.empty(empty_write_count=False)
+    run.write(5)
+    with pytest.raises(ValueError, match="15 rows were written to the buffer, but it holds 5 of 50 and goes"):
+        ReplayJournal(tmp_path).save(run.buffer)
 
 
 def test_a_save_writes_what_is_new_and_not_the_buffer(tmp_path):

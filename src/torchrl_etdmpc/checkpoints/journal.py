@@ -10,7 +10,7 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer, TensorStorage
 
 from torchrl_etdmpc.keys import TARGETS
 from torchrl_etdmpc.runs.files import DamagedFileError, read_tensors, remove_partial_files, write_tensors
@@ -29,7 +29,7 @@ class ReplayJournal:
     files, and :meth:`prune` removes what no list names.
 
     The buffer must be written in order (``add`` and ``extend``, one storage dimension), as
-    :class:`~torchrl_etdmpc.collectors.StepCollector` does.
+    :class:`~torchrl_etdmpc.collectors.StepCollector` does. One that was emptied is written whole again.
 
     Args:
         folder (str or Path): made if missing.
@@ -57,7 +57,9 @@ class ReplayJournal:
         self.rewrite_at = rewrite_at
         self._target_keys = [unravel_key((plan_key, name)) for name in TARGETS]
         self._version_key = unravel_key((plan_key, "version"))
-        self.state: dict[str, Any] = {"written": 0, "version": 0, "rows": [], "targets": []}
+        self.state: dict[str, Any] = _nothing()
+        self._last: tuple[int, TensorDictBase] | None = None
+        """Write number and content of the last row that was saved."""
 
     def save(self, buffer: TensorDictReplayBuffer, *, version: int = 0) -> dict[str, Any]:
         """Writes what is new.
@@ -73,10 +75,12 @@ class ReplayJournal:
 
         Raises:
             OSError: if a file cannot be written; the journal stays as it was.
+            TypeError: if the storage is not a flat tensor storage, or its writer does not write round the ring.
+            ValueError: if rows were not written in order.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
         capacity, written = buffer.storage.max_size, _write_count(buffer)
-        old = self.state
+        self.folder.mkdir(parents=True, exist_ok=True)
+        old = _nothing() if self._was_emptied(buffer, written) else self.state
         new: dict[str, Any] = {"capacity": capacity, "written": written, "version": version}
         new["rows"] = [entry for entry in old["rows"] if entry["end"] > written - capacity]
         new["targets"] = old["targets"]
@@ -93,7 +97,29 @@ class ReplayJournal:
             if targets:
                 new["targets"] = self._save_targets(stored.select(*targets), old, begin, written, capacity)
         self.state = new  # last: a failed save must leave the journal where it was, or those rows are never written
+        self._last = (written - 1, self._row(buffer, written - 1).clone()) if written else None
         return new
+
+    def _row(self, buffer: TensorDictReplayBuffer, number: int) -> TensorDictBase:
+        """What never changes of the row of a write number."""
+        row = cast(TensorDictBase, buffer.storage[number % buffer.storage.max_size])
+        return row.exclude("index", *self._target_keys)
+
+    def _was_emptied(self, buffer: TensorDictReplayBuffer, written: int) -> bool:
+        """Whether the last row that was saved is gone, though nothing has overwritten it.
+
+        Flags do not count: a fault may have made that row the end of its episode.
+        """
+        if self._last is None or self._last[0] < written - buffer.storage.max_size:
+            return False
+        number, row = self._last
+        if number >= written:
+            return True
+        now = self._row(buffer, number)
+        return any(
+            value.dtype != torch.bool and not torch.equal(value.nan_to_num(), now.get(key).nan_to_num())
+            for key, value in row.items(True, True)
+        )
 
     def _save_targets(
         self, stored: TensorDictBase, old: dict[str, Any], begin: int, written: int, capacity: int
@@ -166,6 +192,7 @@ class ReplayJournal:
                 state["_generation"] = times.clamp(min=-1)
             buffer.writer.load_state_dict(state)
         self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
+        self._last = (written - 1, self._row(buffer, written - 1).clone()) if written else None
 
     def read_row(self, files: Mapping[str, Any], row: int) -> TensorDictBase:
         """One row, without its targets; of the files, the one that holds it is read.
@@ -225,7 +252,7 @@ class ReplayJournal:
             if targets is not None:
                 content.update(_rows(targets, position))
             buffer.extend(_rows(content, slice(begin, end)))
-        self.state = {"written": 0, "version": 0, "rows": [], "targets": []}
+        self.state, self._last = _nothing(), None
         return faults
 
     def _read_rows(self, files: Mapping[str, Any]) -> TensorDictBase:
@@ -285,9 +312,26 @@ def _rows(stored: TensorDictBase, index: Tensor | slice) -> TensorDictBase:
     return stored[index]  # pyright: ignore[reportReturnType]  # typed as if it could be a leaf
 
 
+def _nothing() -> dict[str, Any]:
+    return {"written": 0, "version": 0, "rows": [], "targets": []}
+
+
 def _write_count(buffer: TensorDictReplayBuffer) -> int:
-    """How many rows were ever written to the buffer: what a writer stores of itself."""
-    return int(buffer.writer.state_dict()["_write_count"])
+    """How many rows were ever written to the buffer, round the ring: what a writer stores of itself."""
+    storage, writer = buffer.storage, buffer.writer
+    if not isinstance(storage, TensorStorage) or storage.ndim > 1 or not isinstance(writer, RoundRobinWriter):
+        raise TypeError(
+            f"a buffer of {type(storage).__name__}(ndim={storage.ndim}) and {type(writer).__name__} cannot be saved "
+            "row by row; use LazyTensorStorage(capacity) or LazyMemmapStorage(capacity), TensorDictRoundRobinWriter."
+        )
+    state = writer.state_dict()
+    written, capacity = int(state["_write_count"]), storage.max_size
+    if len(storage) != min(written, capacity) or state["_cursor"] != written % capacity:
+        raise ValueError(
+            f"{written} rows were written to the buffer, but it holds {len(storage)} of {capacity} and goes on at row "
+            f"{state['_cursor']}; write to it by add and extend alone, and empty it by empty()."
+        )
+    return written
 
 
 def _device(buffer: TensorDictReplayBuffer) -> torch.device | str:
