@@ -16,6 +16,7 @@ from torchrl.data import (
     TensorDictRoundRobinWriter,
 )
 
+from torchrl_etdmpc import StepSliceSampler
 from torchrl_etdmpc.checkpoints import ReplayJournal
 from torchrl_etdmpc.checkpoints import journal as module
 from torchrl_etdmpc.runs import DamagedFileError
@@ -164,6 +165,29 @@ def test_a_last_row_that_becomes_the_end_of_its_episode_is_still_the_same_row(tm
     run.buffer.storage[:]["next", "done"][9] = True
     run.write(1)
     assert journal.save(run.buffer)["rows"][: len(kept)] == kept
+
+
+@pytest.mark.parametrize("saved", [0, 4, 33])
+@pytest.mark.parametrize("salvage", [False, True])
+def test_a_buffer_that_holds_rows_goes_back_to_what_was_saved(tmp_path, saved, salvage):
+    """A run that is rolled back in the process that made it; the sampler hears of it."""
+    run, journal = Pipeline(make_buffer(20)), ReplayJournal(tmp_path)
+    sampler = StepSliceSampler(2, traj_key="number", done_key=("next", "none"))
+    run.buffer.set_sampler(sampler)
+    if saved:
+        run.write(saved)
+    wanted, files = run.buffer.storage[:].clone() if saved else None, journal.save(run.buffer)
+    run.write(13)
+    if salvage:
+        assert not journal.salvage(run.buffer, files)
+    else:
+        journal.load(run.buffer, files)
+    assert len(run.buffer) == min(saved, 20)
+    held = run.buffer.storage[:]["number"] if saved else torch.zeros(0)
+    assert sorted(held.tolist()) == sorted(wanted["number"].tolist() if saved else [])
+    run.write(2)
+    with pytest.raises(RuntimeError, match="no trajectory in the buffer has 2 steps"):
+        run.buffer.sample()
 
 
 @pytest.mark.parametrize(

@@ -160,11 +160,11 @@ class ReplayJournal:
         return {"file": file, **write_tensors(self.folder / file, content.cpu().to_dict())}
 
     def load(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> None:
-        """Fills an empty buffer, and goes on from there at the next :meth:`save`.
+        """Brings a buffer to where it was saved, and goes on from there at the next :meth:`save`.
 
         Args:
             buffer (TensorDictReplayBuffer): with the capacity of the saved one, or a larger one if the saved one was
-                not full yet.
+                not full yet. It is emptied first, of which its sampler hears.
             files (mapping): what :meth:`save` returned.
 
         Raises:
@@ -177,13 +177,16 @@ class ReplayJournal:
                 f"the saved buffer has capacity {files['capacity']} and {written} rows were written to it; it cannot "
                 f"be loaded into one of capacity {capacity}."
             )
+        rows, position = TensorDict(), torch.arange(max(written - capacity, 0), written) % capacity
         if written:
             rows = self._read_rows(files)
-            position = torch.arange(written - len(rows), written) % capacity
             targets = self._read_targets(files["targets"], len(rows))
             if targets is not None:
                 rows.update(_rows(targets, position))
             rows.set("index", position)  # TensorDict buffers number their rows
+        if len(buffer):  # it may hold more than was saved
+            buffer.empty()
+        if written:
             device = _device(buffer)
             buffer.storage.set(position.to(device), rows.to(device))  # pyright: ignore[reportArgumentType]
             state = {"_cursor": written % capacity, "_write_count": written}
@@ -213,12 +216,12 @@ class ReplayJournal:
         return cast(TensorDictBase, self._read(entry)[number - entry["begin"]])
 
     def salvage(self, buffer: TensorDictReplayBuffer, files: Mapping[str, Any]) -> list[str]:
-        """Fills an empty buffer with the longest stretch of rows that can still be read, as if they were new.
+        """Fills a buffer with the longest stretch of rows that can still be read, as if they were new.
 
         The next :meth:`save` writes all of them again.
 
         Args:
-            buffer (TensorDictReplayBuffer): of the capacity of the saved one.
+            buffer (TensorDictReplayBuffer): of the capacity of the saved one. It is emptied first.
             files (mapping): what :meth:`save` returned.
 
         Returns:
@@ -248,6 +251,8 @@ class ReplayJournal:
                 faults.append(str(error))
                 readable &= position // -(-capacity // PARTS) != part  # also those that came after its base
         begin, end = _longest(readable)
+        if len(buffer):
+            buffer.empty()
         if content is not None and end > begin:
             if targets is not None:
                 content.update(_rows(targets, position))
