@@ -12,7 +12,11 @@ from torchrl.data import (
     Binary,
     Bounded,
     Composite,
+    LazyMemmapStorage,
+    LazyStackStorage,
     LazyTensorStorage,
+    ListStorage,
+    ReplayBuffer,
     TensorDictReplayBuffer,
     TensorDictRoundRobinWriter,
     Unbounded,
@@ -906,6 +910,20 @@ def test_collection_that_goes_on_after_a_non_finite_step_starts_a_fresh_episode(
     assert [steps[-1]["next", "truncated"].item() for steps in rows.values()] == [True] * 4
     for steps in rows.values():
         assert [int(row["observation"][1]) for row in steps] == list(range(len(steps)))
+
+
+@pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])
+@pytest.mark.parametrize("storage", [LazyMemmapStorage, ListStorage, LazyStackStorage])
+def test_a_fault_ends_episodes_in_other_storages_too(storage, lengths):
+    replay = ReplayBuffer(storage=storage(100))
+    collector = StepCollector(make_env(lengths, broken="reward", broken_at=3), RandomActions(), replay_buffer=replay)
+    with pytest.raises(NonFiniteError, match="at decision step"):
+        while True:
+            collector.step()
+    rows = [replay.storage[row] for row in range(len(replay))]
+    flags = [[row["next", name].item() for row in rows] for name in ("truncated", "done", "terminated")]
+    running = [False] * len(lengths)
+    assert flags == [running + [True] * len(lengths)] * 2 + [running * 2]
 
 
 @pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])

@@ -272,22 +272,20 @@ class StepCollector(BaseCollector):
 
     def _end_rows(self, rows: torch.Tensor, trajectories: torch.Tensor) -> None:
         """Makes rows of the buffer truncated ends, where they still are of these trajectories."""
-        storage = self.replay_buffer.storage
-        there = rows < len(storage)
-        rows, trajectories = rows[there], trajectories[there]
-        if len(rows):
-            held = storage.get(rows).clone()
-            now = held.get(TRAJECTORY, None)
-            same = torch.ones_like(rows, dtype=torch.bool) if now is None else now.reshape(-1).cpu() == trajectories
-            rows, trajectories, held = rows[same], trajectories[same], held[same.to(held.device or "cpu")]
-        if not len(rows):
+        storage, ended = self.replay_buffer.storage, {}
+        for row, trajectory in zip(rows.tolist(), trajectories.tolist(), strict=True):
+            held = storage.get(row).clone() if row < len(storage) else None  # one by one, as lists hold them
+            if held is None or int(held.get(TRAJECTORY, trajectory)) != trajectory:
+                continue
+            _truncate(held)
+            storage.set(row, held, set_cursor=False)
+            ended[row] = trajectory
+        if not ended:
             return
-        _truncate(held)
-        storage.set(rows, held, set_cursor=False)
-        self._ended_rows |= dict(zip(rows.tolist(), trajectories.tolist(), strict=True))
+        self._ended_rows |= ended
         end_episodes = getattr(self.replay_buffer.sampler, "end_episodes", None)
         if end_episodes is not None:  # it may have followed the rows already
-            end_episodes(rows, storage)
+            end_episodes(torch.tensor(list(ended)), storage)
 
     def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:
         for key in keys:
