@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 import torchrl.envs
-from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, NonTensor, OneHot, Unbounded
 from torchrl.envs import (
     ActionScaling,
     Compose,
@@ -72,6 +72,15 @@ _MENDED = {
     "two vectors": (
         {"observations": {"position": Unbounded(2), "velocity": Unbounded(3)}},
         "observation is missing (append CatTensors(in_keys=['position', 'velocity'], out_key='observation'))",
+    ),
+    "a text beside a vector": (
+        {"observations": {"instruction": NonTensor(shape=()), "position": Unbounded(2)}},
+        "observation is missing (append CatTensors(in_keys=['position'], out_key='observation'))",
+    ),
+    "a number and a vector": (
+        {"observations": {"height": Unbounded(()), "position": Unbounded(2)}},
+        "height is a single number (append UnsqueezeTransform(-1, in_keys=['height'])); "
+        "observation is missing (append CatTensors(in_keys=['height', 'position'], out_key='observation'))",
     ),
     "float64 observation": (
         {"observations": {"observation": Unbounded(3, dtype=torch.float64)}},
@@ -156,6 +165,7 @@ _REFUSED = {
         "observation is discrete (OneHot), which is not supported",
     ),
     "nothing to see": ({"observations": {}}, "observation is missing; "),
+    "a text": ({"observations": {"instruction": NonTensor(shape=())}}, "observation is missing; "),
     "discrete actions": (
         {"action": Categorical(4, shape=())},
         "action is discrete (Categorical); only continuous actions are supported",

@@ -128,9 +128,11 @@ def _observation(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) ->
     spec = specs.get(key, None)
     name = _text(key)
     if spec is None:
-        entries = [(key, leaf) for key, leaf in specs.items(True, True) if key != "episode_reward"]
+        entries = [(key, leaf) for key, leaf in specs.items(True, True) if leaf.dtype and key != "episode_reward"]
         vectors = [key for key, leaf in entries if leaf.dtype.is_floating_point and len(_shape(env, leaf)) < 2]
         if vectors:
+            for number in (each for each in vectors if not _shape(env, specs[each])):
+                yield f"{_text(number)} is a single number (append UnsqueezeTransform(-1, in_keys=[{number!r}]))"
             yield f"{name} is missing (append CatTensors(in_keys={vectors}, out_key={key!r}))"
         elif any(_is_pixels(env, leaf) for _, leaf in entries):
             yield f"{name} is missing, and pixel observations are not supported"
