@@ -20,7 +20,8 @@ _PENDULUM, _HOPPER = "gym/Pendulum-v1", pytest.param("gym/Hopper-v5", marks=need
 class Recorder(gymnasium.Env):
     """Keeps the actions that arrive, counts steps, hands out the same memory as observation every time."""
 
-    def __init__(self, observation=None, action=None, ends=1000):
+    def __init__(self, observation=None, action=None, ends=1000, reward=0.5):
+        self.reward = reward
         self.observation_space = observation or Box(-np.inf, np.inf, (2, 3), np.float64)
         self.action_space = action or Box(np.array([-2, 0.5]), np.array([0, 3.5]), dtype=np.float64)
         self.arrived, self.steps, self.ends = [], 0, ends
@@ -37,7 +38,7 @@ class Recorder(gymnasium.Env):
         self.arrived.append(action)
         self.steps += 1
         self.memory[...] = self.steps
-        return self.memory, np.float64(0.5), self.steps >= self.ends, False, {}
+        return self.memory, self.reward, self.steps >= self.ends, False, {}
 
 
 @pytest.fixture
@@ -100,6 +101,19 @@ def test_an_observation_of_any_shape_is_a_float32_vector_in_memory_of_its_own(re
     assert second["next", "observation"].dtype == torch.float32
     assert second["next", "observation"].tolist() == [1] * 6
     assert torch.equal(first["observation"], before)  # the environment has written over its own
+
+
+@pytest.mark.parametrize("reward", [2, 2.0, np.float32(2), np.array(2), np.array([2.0])], ids=repr)
+def test_a_reward_is_a_number_of_any_kind_or_an_array_of_one(reward, recorder):
+    assert make_env(recorder(reward=reward)).rollout(2)["next", "reward"].tolist() == [[2.0], [2.0]]
+
+
+def test_a_task_that_is_not_asked_how_it_is_drawn_is_made_all_the_same(recorder, monkeypatch):
+    """Some say how they can be drawn and take no ``render_mode``."""
+    monkeypatch.setattr(Recorder, "metadata", {"render_modes": ["rgb_array"]})
+    env = make_env(recorder())
+    assert env._env.render_mode is None
+    assert env.rollout(2).shape == (2,)
 
 
 def test_an_end_terminates_and_cuts_the_action_repeat_short(recorder):

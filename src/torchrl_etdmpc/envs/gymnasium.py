@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import inspect
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -52,7 +53,8 @@ class RecordedGymnasiumEnv(RecordedEnv, GymWrapper):
     def _advance(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         action = action.astype(self._action_dtype).reshape(self._action_shape)
         self._observation, reward, terminated, truncated, _ = self._env.step(action)
-        return self._observation, float(reward), bool(terminated), bool(truncated)
+        # TorchRL's own wrapper takes arrays of one entry too, which float does not.
+        return self._observation, float(np.asarray(reward).item()), bool(terminated), bool(truncated)
 
     def _random_state(self, seed: int | None = None, options: dict | None = None) -> Tensor | None:
         from gymnasium.utils import seeding
@@ -108,6 +110,8 @@ def _make(spec: Any, task: Task, *, device: torch.device | str) -> RecordedGymna
         # To be asked for at once, by an environment that may be filmed; nothing is loaded before the first frame.
         modes = getattr(creator, "metadata", {})
         filmable = isinstance(modes, dict) and "rgb_array" in (modes.get("render_modes") or ())
+        parameters = inspect.signature(creator).parameters.values() if filmable else ()
+        filmable = any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters)
         with _quiet_mujoco():
             env = gymnasium.make(
                 spec,
