@@ -448,6 +448,13 @@ def test_an_unknown_insertion_is_refused():
         StepCollector(make_env(), RandomActions(), replay_buffer=make_replay(), insertion="batch")
 
 
+@pytest.mark.parametrize("key", ["plan_mean", ("next", "plan_mean")])
+def test_one_key_is_not_taken_for_a_list_of_keys_to_leave_out(key):
+    """The letters of a name would leave out nothing, the parts of a nested one everything below "next"."""
+    with pytest.raises(ValueError, match="exclude_keys must be a list of keys"):
+        StepCollector(LineEnv(), RandomActions(), replay_buffer=make_replay(), exclude_keys=key)
+
+
 def test_an_environment_whose_done_has_another_name_is_refused():
     env = TransformedEnv(LineEnv(), RenameTransform(["done"], ["over"], create_copy=False))
     with pytest.raises(ValueError, match=r"^StepCollector needs the key 'done' of an environment, got \[.*'over'"):

@@ -99,6 +99,8 @@ class StepCollector(BaseCollector):
             )
         if insertion not in ("step", "episode"):
             raise ValueError(f"insertion must be 'step' or 'episode', got {insertion!r}.")
+        if isinstance(exclude_keys, str) or "next" in exclude_keys:  # one key, taken for several
+            raise ValueError(f"exclude_keys must be a list of keys, e.g. [('next', 'info')], got {exclude_keys!r}.")
         env = create_env_fn if isinstance(create_env_fn, EnvBase) else create_env_fn()
         if len(env.batch_size) > 1:
             raise ValueError(
