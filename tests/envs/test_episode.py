@@ -309,6 +309,26 @@ def test_a_state_of_other_transforms_is_noticed():
     assert not load_simulator_state(larger, simulator_state(larger) | {"transforms": frames})
 
 
+@needs_gym
+@pytest.mark.parametrize(("saved", "loading"), [(2, 1), (1, 2), (2, 3), (3, 2)])
+def test_a_state_of_another_number_of_environments_leads_nowhere(saved, loading):
+    env = make_env("gym/Pendulum-v1", saved, parallel=False)
+    env.rollout(3)
+    other = make_env("gym/Pendulum-v1", loading, parallel=False)
+    assert not load_simulator_state(other, simulator_state(env))
+    assert other.rollout(3).shape[-1] == 3
+
+
+@needs_gym
+@pytest.mark.parametrize("num_envs", [1, 2])
+@pytest.mark.parametrize("tasks", [("cheetah-run", "gym/Pendulum-v1"), ("gym/Pendulum-v1", "cheetah-run")])
+def test_a_state_of_another_suite_leads_nowhere(tasks, num_envs):
+    env, other = (make_env(task, num_envs, parallel=False) for task in tasks)
+    env.rollout(3)
+    assert not load_simulator_state(other, simulator_state(env))
+    assert other.rollout(3).shape[-1] == 3
+
+
 def test_a_collector_whose_simulator_does_not_come_back_begins_fresh_episodes_and_says_so():
     envs = [make_env("walker-walk", 1, parallel=False) for _ in range(2)]
     collectors = [

@@ -128,8 +128,8 @@ class RecordedEnv(EnvBase):
         """
         if state is None:
             return
-        self._set_random_state(state["random"])
         with contextlib.suppress(Exception):  # what failed there fails here, too, and a worker process must outlive it
+            self._set_random_state(state["random"])
             self.restored = self._reset().get("observation"), False
             self.go_on(state["actions"])
 
@@ -198,7 +198,7 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
     """Brings the environment to a saved place; ``False`` if it did not get there exactly.
 
     Args:
-        env (EnvBase): made as the one that was saved.
+        env (EnvBase): made as the one that was saved; another one does not get there.
         state (dict, optional): of :func:`simulator_state`; ``None`` is ``False``.
 
     Returns:
@@ -213,7 +213,11 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
     if state is None:
         return False
     simulator = simulator_of(env)
-    simulator.load_state_dict({name: part for name, part in state.items() if name != _TRANSFORMS})
+    saved = {name: part for name, part in state.items() if name != _TRANSFORMS}
+    workers = range(simulator.num_workers) if isinstance(simulator, BatchedEnvBase) else ()
+    if {name for name in saved if name.startswith("worker")} != {f"worker{number}" for number in workers}:
+        return False  # of another number of environments; TorchRL would load some and fail at the others
+    simulator.load_state_dict(saved)
     # TorchRL 0.14: a ParallelEnv's workers report that they are done twice, and the next step would not wait for them.
     flags = simulator.__dict__.get("_shm_done_flags")
     if flags is not None:
