@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import nn
 from torchrl.collectors import BaseCollector
-from torchrl.data import ReplayBuffer
+from torchrl.data import ListStorage, ReplayBuffer
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
@@ -246,6 +246,8 @@ class StepCollector(BaseCollector):
 
     def _store(self, kept: TensorDictBase, trajectories: torch.Tensor) -> None:
         if self.insertion == "step":
+            if isinstance(getattr(self.replay_buffer, "storage", None), ListStorage):
+                kept = kept.clone()  # it keeps what it is given, which the caller gets too
             # Adding one row takes half the time of extending by it.
             rows = self.replay_buffer.extend(kept) if kept.ndim else self.replay_buffer.add(kept)
             self._last_rows = rows, trajectories
