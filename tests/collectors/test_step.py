@@ -937,7 +937,7 @@ def test_a_fault_ends_episodes_in_other_storages_too(storage, lengths):
 @pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])
 @pytest.mark.parametrize("capacity", [100, 8])  # 8: a ring that is written over
 def test_a_sampler_that_followed_an_episode_learns_that_a_fault_ended_it(lengths, capacity):
-    replay = make_replay(capacity, sampler=StepSliceSampler(3, partial=True), batch_size=600)
+    replay = make_replay(capacity, sampler=StepSliceSampler(3, partial=True), batch_size=6000)
     env = make_env(lengths, broken="reward", broken_at=14)
     collector = StepCollector(env, RandomActions(), replay_buffer=replay)
     with pytest.raises(NonFiniteError):
