@@ -29,6 +29,7 @@ Table = Any  # of pandas, which is imported where it is used
 REFERENCE = Path(__file__).resolve().parents[1] / "analysis" / "reference"
 DEFAULT_REFERENCES = tuple(REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget"))
 DEFAULT_GRID_STEP = 100_000
+MOST_SECONDS = 1e9  # that a process can sleep
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -84,16 +85,22 @@ def parse() -> argparse.Namespace:
         arguments.points = [] if theirs else [REFERENCE / "points.csv"]
     if arguments.benchmark is not None:
         get_benchmark(arguments.benchmark)  # a wrong name ends here, also when watching
+    if not arguments.out:  # of an unset variable of the shell, as below
+        raise ValueError("--out must not be empty; leave it out for report.")
     if Path(arguments.out).expanduser().is_file():
         raise ValueError(f"--out={arguments.out} is a file; name a folder.")
     for argument in arguments.runs:
         name, path = named(argument)
+        if not path or name == "":
+            raise ValueError(f"runs are PATH or NAME=PATH, and neither may be empty, got {argument!r}.")
         if name is not None and hasattr(arguments, name.replace("-", "_")):
             raise ValueError(f"{argument} would call runs {name!r}; an option is written --{name} {path}.")
     for name in ("budget", "grid_step", "grid_start", "watch"):
         value = getattr(arguments, name)
         if value is not None and value <= 0:
             raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value:g}.")
+    if arguments.watch is not None and not arguments.watch < MOST_SECONDS:
+        raise ValueError(f"--watch must be a number of seconds below {MOST_SECONDS:g}, got {arguments.watch:g}.")
     return arguments
 
 
@@ -176,7 +183,8 @@ def choose_budget(
         steps = [budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0]
         step = next((step for step in steps if step >= first), steps[-1] if steps else None)
         if step is None and arguments.budget:
-            raise ValueError(f"--budget={budget} has no grid of equal steps; take {budget - 1} or {budget + 1}.")
+            near = f"{budget - 1} or {budget + 1}" if budget > 1 else "2"
+            raise ValueError(f"--budget={budget} has no grid of equal steps; take {near}.")
         if budget < 2:
             raise ValueError("the runs end at 1 env step, which makes no curve; wait for an evaluation after it.")
         if step is None:
