@@ -12,7 +12,7 @@ import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
-from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
+from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, trained_with, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, make_env
@@ -85,6 +85,13 @@ def main(config: InspectConfig) -> None:
 def _inspection(config: InspectConfig) -> Inspection:
     device = resolve_device(config.device)
     task = config.task_spec
+    own = trained_with(config.checkpoint).task
+    elsewhere = config.task not in (None, own)
+    if elsewhere and config.state.startswith("replay"):
+        raise ValueError(
+            f"state={config.state} is a row of {own}, on which the agent was trained, and none of {task.name}; leave "
+            "task=... out, or choose a state of an episode."
+        )
     _need_no_renderer(task)
     sizes = {} if config.state.startswith("replay") else _sizes(task)  # a row of the buffer needs no simulator
     agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off", **sizes)
@@ -92,7 +99,7 @@ def _inspection(config: InspectConfig) -> Inspection:
     about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
     store = CheckpointStore(path.parent)
     try:
-        rows = store.buffer_rows()
+        rows = 0 if elsewhere else store.buffer_rows()
     except CheckpointError:
         rows = 0  # the agent file is what was asked for
     return Inspection(
