@@ -151,3 +151,9 @@ def test_cuda_without_a_device_is_refused(monkeypatch, name):
         resolve_device(name)
     expected = f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
     assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize("name", ["gpu", "meta", "mps", "cuda:first"])
+def test_another_device_is_refused_by_its_name(name):
+    with pytest.raises(ValueError, match=f"^device must be one of auto, cpu, cuda, cuda:N, got '{name}'.$"):
+        resolve_device(name)

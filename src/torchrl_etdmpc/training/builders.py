@@ -11,7 +11,7 @@ from torchrl_etdmpc.collectors import SeedPolicy, StepCollector
 from torchrl_etdmpc.keys import NEXT, TRAJECTORY, WORKER
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 from torchrl_etdmpc.training.agent import Agent
-from torchrl_etdmpc.training.config import TrainConfig, named_settings
+from torchrl_etdmpc.training.config import TrainConfig, check_device, named_settings
 from torchrl_etdmpc.training.distributed import DistributedConfig, WorkerCollector
 
 # What an environment or a policy writes and nothing reads from a stored row: less to write at every step.
@@ -27,11 +27,12 @@ def resolve_device(name: str) -> torch.device:
     A CUDA device becomes PyTorch's current one, and products on it may use TF32, as in training.
 
     Raises:
-        ValueError: if CUDA is asked for and not there.
+        ValueError: if it is none of these, or CUDA is asked for and not there.
 
     >>> resolve_device("cpu")
     device(type='cpu')
     """
+    check_device(name)
     there = torch.cuda.is_available()
     device = torch.device(("cuda" if there else "cpu") if name == "auto" else name)
     if device.type == "cuda":

@@ -268,10 +268,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         _check_types(self)
-        _require(
-            re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device) is not None,
-            f"device must be one of auto, cpu, cuda, cuda:N, got {self.device!r}.",
-        )
+        check_device(self.device)
         _require(
             self.checkpoint_minutes is None or self.checkpoint_minutes > 0,
             f"checkpoint_minutes must be positive or null, got {self.checkpoint_minutes}.",
@@ -500,6 +497,14 @@ def _choices(hint: Any) -> bool:
 # What single precision holds with room for sums and squares of it, and what a float counts without a gap.
 _LARGEST_FLOAT = 1e30
 _LARGEST_INT = 2**53
+
+
+def check_device(name: str) -> None:
+    """Refuses what is none of the devices that a run or a command can be on."""
+    _require(
+        re.fullmatch(r"auto|cpu|cuda(:\d+)?", name) is not None,
+        f"device must be one of auto, cpu, cuda, cuda:N, got {name!r}.",
+    )
 
 
 def _require(condition: bool, message: str) -> None:
