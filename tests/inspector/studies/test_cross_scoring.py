@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from torchrl_etdmpc.inspector.studies import choose_states, cross_scoring
+from torchrl_etdmpc.modules import ActionValueWorldModel
+from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
 from torchrl_etdmpc.testing import LineWorld
 
 BUDGET = {"num_samples": 256, "num_elites": 16}
@@ -36,6 +38,14 @@ def test_all_estimates_agree_where_all_heads_are_exact(make_episodes, make_plann
     assert result.scale == 20
     assert torch.allclose(result.gain[:, 0], 20 * (result.returns[:, 0] - result.returns[:, 2]))
     assert (result.gain[:, :, 2] > 0).all()  # half of the best action is not the best
+
+
+def test_a_critic_whose_heads_are_drawn_is_refused(make_episodes):
+    world = LineWorld()
+    states = choose_states(make_episodes(world, world.optimal_action), 2, ahead=3)
+    planner = EnsembleMPPIPlanner(LatentEnv(ActionValueWorldModel(1, 1, latent_dim=16, mlp_dim=16, encoder_dim=16)))
+    with pytest.raises(ValueError, match="critic must be of states, got ActionValueWorldModel, with which plans"):
+        cross_scoring.cross_scoring(planner, states, None, **BUDGET)
 
 
 def test_the_table_has_an_interval_around_every_gain():

@@ -17,6 +17,7 @@ from torchrl_etdmpc.inspector.studies.replan import (
     true_returns,
 )
 from torchrl_etdmpc.inspector.studies.states import States, TrueWorld, episode_interval, roll_all
+from torchrl_etdmpc.modules.prediction import has_action_values
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 
 FOUND_BY = ("single head", "ensemble", "policy")
@@ -70,7 +71,15 @@ def cross_scoring(
         iterations (int): Default: 6.
         decisions (int): of an episode. Default: 500.
         seed (int): of the plans.
+
+    Raises:
+        ValueError: if the critic also reads the action, as TD-MPC2's: there is no single head to plan by.
     """
+    if has_action_values(planner.world_model):
+        raise ValueError(
+            f"critic must be of states, got {type(planner.world_model).__name__}, with which plans are made by two "
+            "heads that are drawn anew in every iteration; take an agent whose critic reads the state alone."
+        )
     budget = {"num_samples": num_samples, "num_elites": num_elites, "iterations": iterations, "extra_iterations": 0}
     proposals = num_proposals if planner.num_proposals else 0
     found = []
