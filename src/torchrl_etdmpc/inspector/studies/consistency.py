@@ -16,13 +16,13 @@ COMPARED = ("warm start", "cold start", "other samples")
 
 
 class Consistency(NamedTuple):
-    """Distance of two plans of the same step, in units of the new plan's standard deviation, from S states."""
+    """Distance of two plans of the same step, in standard deviations of the plan from the warm start, from S states."""
 
     change: Tensor
     """``[S, 3, H]``, root mean squared over action dimensions; by ``COMPARED``. The first two are from the plan
     before, which has nothing to say of the last depth: NaN there."""
     std: Tensor
-    """Of the new plan, mean over action dimensions, ``[S, H]``."""
+    """Of the plan from the warm start, mean over action dimensions, ``[S, H]``."""
     episode: Tensor
     """``[S]``"""
 
