@@ -95,6 +95,13 @@ def test_the_gaussian_is_that_of_the_iteration(trace):
         assert np.array_equal(line.customdata, trace["std"][0, :, number])
 
 
+def test_the_deviation_of_a_plan_of_one_step_is_a_bar():
+    one = make(horizon=1)
+    (line,) = drawn(figures.plan_gaussian(one), "a1")
+    assert np.array_equal(line.error_y.array, one["std"][-1, :, 0])
+    assert drawn(figures.plan_gaussian(make()), "a1")[0].error_y.array is None
+
+
 def test_many_action_dimensions_are_an_image():
     many = make(action_dim=9)
     mean, std = figures.plan_gaussian(many, 1).data

@@ -65,7 +65,12 @@ def plan_gaussian(trace: Trace, iteration: int = -1) -> Drawing:
             "showlegend": False,
             "legendgroup": str(number),
         }
-        said = {"customdata": std[:, number], "hovertemplate": "step %{x}: %{y:.3f} ± %{customdata:.3f}"}
+        said: dict[str, Any] = {
+            "customdata": std[:, number],
+            "hovertemplate": "step %{x}: %{y:.3f} ± %{customdata:.3f}",
+        }
+        if len(steps) == 1:  # a band over one step has no width
+            said["error_y"] = {"type": "data", "array": std[:, number]}
         mark = line(f"a{number + 1}", steps, mean[:, number], legendgroup=str(number), **said, **look)
         data += [band, mark]
     place = {"legend": {"orientation": "v", "x": 1.02, "y": 1}, "margin": {"l": 55, "r": 60, "t": 30, "b": 45}}
