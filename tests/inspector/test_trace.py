@@ -274,6 +274,12 @@ def test_a_trace_comes_back_from_its_file(tmp_path):
     assert all(np.array_equal(again[name], trace[name]) for name in trace.arrays)
 
 
+@pytest.mark.parametrize("name", ["state", "checkpoint"])
+def test_what_a_page_looks_up_by_name_is_refused_as_text_before_it_is_in_a_file(name):
+    with pytest.raises(TraceError, match=f"^{name} in the manifest of a trace must be names with values, got 'mine'; "):
+        trace_plan(make(), OBSERVATION, **{name: "mine"})
+
+
 def test_a_trace_is_read_by_numpy_alone(tmp_path):
     trace = trace_plan(make(), OBSERVATION, task="walker-walk")
     path = trace.save(tmp_path / "trace.npz")
@@ -365,7 +371,7 @@ def without_start(manifest, arrays):
         (missing, "a trace needs the array 'mean', which is missing"),
         (unknown, "a trace has no array 'surprise'"),
         (text, "value of a trace must hold numbers, got <U4"),
-        (state_of_text, "is not a trace: state in its manifest must be names with values"),
+        (state_of_text, "is not a trace: state in the manifest of a trace must be names with values"),
         (nobody, r"elites of a trace must be whole numbers in \[0, 23\], its candidates"),
         (half_a_candidate, r"elites of a trace must be whole numbers in \[0, 23\], its candidates"),
         (less_than_nobody, r"chosen of a trace must be whole numbers in \[-1, 23\], its candidates"),

@@ -59,7 +59,7 @@ def trace_plan(
         progress (callable, optional): called between iterations with how many steps are done, of how many: an
             iteration is a step of planning and one of following its candidates through latent space. What it raises,
             e.g. :class:`Cancelled`, ends the call.
-        **about: plain values for the manifest, e.g. ``task``, ``state`` and ``checkpoint``.
+        **about: plain values for the manifest, e.g. ``task="mine"``; ``state`` and ``checkpoint`` are mappings.
 
     Raises:
         ValueError: if the state or the warm start has another size than the model's.

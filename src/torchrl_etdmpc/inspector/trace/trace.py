@@ -115,7 +115,8 @@ class Trace:
         arrays (mapping of str to ndarray): some of the above.
 
     Raises:
-        TraceError: if an array is missing, has another shape, names no candidate or is unknown.
+        TraceError: if an array is missing, has another shape, names no candidate or is unknown, or the manifest's
+            ``settings``, ``state`` or ``checkpoint`` is no mapping.
 
     >>> from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
     >>> from torchrl_etdmpc.inspector import trace_plan
@@ -133,6 +134,13 @@ class Trace:
     arrays: Mapping[str, np.ndarray]
 
     def __post_init__(self) -> None:
+        for name in ("settings", "state", "checkpoint"):
+            value = self.manifest.get(name, {})
+            if not isinstance(value, Mapping) and (name, value) != ("checkpoint", None):
+                raise TraceError(
+                    f"{name} in the manifest of a trace must be names with values, got {value!r}; write "
+                    f"{{'name': {value!r}}}."
+                )
         missing = sorted(REQUIRED.keys() - self.arrays.keys())
         if missing:
             raise TraceError(
@@ -253,9 +261,6 @@ def load_trace(path: str | Path) -> Trace:
     missing = {"settings", "planner", "state"} - manifest.keys()
     if missing:
         raise TraceError(f"{path} is not a whole trace: its manifest lacks {', '.join(sorted(missing))}.")
-    wrong = [name for name in ("settings", "state") if not isinstance(manifest[name], dict)]
-    if wrong:
-        raise TraceError(f"{path} is not a trace: {wrong[0]} in its manifest must be names with values.")
     try:
         return Trace(manifest, arrays)
     except TraceError as error:
