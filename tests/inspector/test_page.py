@@ -481,6 +481,15 @@ def test_a_step_beyond_the_end_of_what_is_chosen_is_the_last_one(with_replay):
     assert ask(app, "step.value", "source.value", source="replay", episode=None, step=60) == {"step": {"value": 49}}
 
 
+@pytest.mark.parametrize("name", ["episode", "step", "seed"])
+@pytest.mark.parametrize("number", [None, -1, 1.5, 2**31, 2**70])
+def test_a_number_that_is_none_is_named_before_anything_is_planned(with_replay, name, number):
+    at = {"source": "replay", "episode": 0, "step": 7, "seed": 5} | {name: number}
+    said = ask(make_page(with_replay), "trace-a.data", f"{name}.value", **at)
+    assert said["error"]["children"] == "episode, step and seed must be whole numbers in [0, 2**31 - 1]."
+    assert "trace-a" not in said
+
+
 def test_what_is_shown_is_saved_whatever_the_controls_say_by_now(with_replay, tmp_path, monkeypatch):
     monkeypatch.setattr("torchrl_etdmpc.inspector.saved_page.picture", lambda frame: "data:,")
     with_replay.play(0)

@@ -53,15 +53,15 @@ def connect_plans(app: Any, inspection: Inspection) -> None:
         if ctx.triggered_id not in ("poll", "cancel"):
             names = [entry["id"]["name"] for entry in ctx.inputs_list[4]]
             try:
-                if None in (episode, step, seed):
-                    raise ValueError("episode, step and seed must be whole numbers from 0 on.")
-                state = Chosen(int(episode), int(step), replay=source == "replay")
+                if not all(isinstance(given, int) and 0 <= given < 2**31 for given in (episode, step, seed)):
+                    raise ValueError("episode, step and seed must be whole numbers in [0, 2**31 - 1].")
+                state = Chosen(episode, step, replay=source == "replay")
                 changes = changed_settings(inspection, names, values)
             except ValueError as error:
                 if number in jobs:
                     jobs[number].stop.set()  # nobody will look at what it comes to
                 return no_update, no_update, True, "", "0", "hidden", "hidden", str(error)
-            job = inspection.start(state, changes, like=held, seed=int(seed))
+            job = inspection.start(state, changes, like=held, seed=seed)
             number = max(jobs, default=0) + 1
             jobs[number] = job
             jobs.pop(number - 8, None)
