@@ -410,6 +410,12 @@ def test_a_state_to_begin_with_is_planned_first(inspection):
     assert '"value": 3' in text
 
 
+def test_the_settings_that_come_back_are_those_of_the_start_and_are_called_so(with_replay):
+    app = make_page(with_replay)  # of a planner that the command may have been told to change
+    text = json.dumps(app.layout.to_plotly_json(), default=lambda part: part.to_plotly_json())
+    assert '"children": "as at the start", "id": "reset"' in text
+
+
 def test_the_seed_of_the_noise_to_begin_with_is_shown(inspection):
     text = json.dumps(
         make_page(inspection, seed=17).layout.to_plotly_json(), default=lambda part: part.to_plotly_json()

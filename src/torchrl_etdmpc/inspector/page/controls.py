@@ -58,7 +58,7 @@ def controls(inspection: Inspection, first: State, folder: str, seed: int) -> li
         _named("seed of the noise", dcc.Input(id="seed", type="number", min=0, step=1, value=seed, debounce=True)),
     ]
     values = plain_settings(inspection.planner)
-    settings = [html.H2("Planner"), html.Button("as it was trained", id="reset"), html.Div(id="unused")]
+    settings = [html.H2("Planner"), html.Button("as at the start", id="reset")]
     settings += [_control(setting, values[name]) for name, setting in inspection.settings.items()]
     second = [
         html.H2("Second setting"),
