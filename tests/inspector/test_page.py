@@ -403,6 +403,20 @@ def test_nothing_is_cut_off_on_paper(page, tmp_path):
     assert "3 of 3" in page.text("iteration-value")
 
 
+@pytest.mark.slow
+def test_two_settings_stand_below_each_other_on_a_narrow_screen(page, tmp_path):
+    trace = expected(0)
+    page.driver.get(write_page(tmp_path / "page", trace, trace).as_uri())
+    wait_for(lambda: shows(page, trace, "b", -1), "the saved plan")
+    script = """return ['a', 'b'].map(side =>
+        document.getElementById('return_table-' + side).getBoundingClientRect().left)"""
+    for width, beside in ((1000, True), (500, False)):
+        screen = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        first, second = page.driver.execute_script(script)
+        assert (second > first) == beside
+
+
 def test_a_state_to_begin_with_is_planned_first(inspection):
     app = make_page(inspection, state=State(episode=3, step=2), folder=Path("elsewhere"))
     text = json.dumps(app.layout.to_plotly_json(), default=lambda part: part.to_plotly_json())
