@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from torchrl_etdmpc.inspector.studies import choose_states, consistency
+from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.testing import LineWorld
 
 MOVED = 0.3
@@ -35,6 +36,23 @@ def test_a_plan_that_was_right_survives_and_one_that_was_moved_is_as_far_as_it_w
     assert (found[0.0].change[:, :, 0] < 1).all()
     assert found[0.0].change[:, :2, -1].isnan().all()  # the plan before ends there
     assert not found[0.0].change[:, 2].isnan().any()
+
+
+def test_every_change_is_measured_by_the_last_deviation_of_the_plan_from_the_warm_start(
+    world, make_episodes, make_planner
+):
+    planner = make_planner(world)
+    states = choose_states(make_episodes(world, world.optimal_action), 9)  # whose plans before are zeros
+    result = consistency.consistency(planner, states, seed=3)
+    kept, generator = states.step > 0, generator_of(planner, 3)
+    warm, _, cold = (
+        replan(planner, states.observation[kept], carried, generator=generator, trace=True)
+        for carried in (states.plan_mean[kept], states.plan_mean[kept], None)
+    )
+    std = warm.trace.std[:, -1]
+    assert torch.allclose(result.std, std.mean(-1))
+    for row, plan in enumerate((warm, cold)):
+        assert torch.allclose(result.change[:, row, :-1], (plan.mean / std).abs()[:, :-1, 0])
 
 
 def test_first_decisions_are_left_out_and_states_without_plans_refused(world, make_episodes, make_planner):
