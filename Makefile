@@ -12,6 +12,9 @@ PORT ?= 8000
 VENV := .venv
 READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
+# pip compiles on one core and takes as long again as for the rest; files that were written for other versions of Python
+# do not compile, nor are they imported.
+COMPILE = $(VENV)/bin/python -m compileall -qq -j 0 $(VENV)/lib || true
 # HumanoidBench simulates what it was published with only on an older MuJoCo, so it has an environment of its own.
 HUMANOID_BENCH ?=
 HUMANOID_REPOSITORY := https://github.com/carlosferrazza/humanoid-bench
@@ -87,7 +90,8 @@ docs-serve: $(DOCS_READY)
 
 $(DOCS_READY): requirements-docs.txt $(READY)
 	@echo "installing what builds the documentation"
-	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements-docs.txt
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-compile -r requirements-docs.txt
+	@$(COMPILE)
 	@touch $@
 
 # The mark is written last, so that an interrupted installation starts over; and it starts from nothing, because
@@ -103,7 +107,8 @@ $(READY): requirements-pins.txt pyproject.toml
 	@rm -rf $(VENV)
 	@$(PYTHON) -m venv $(VENV)
 	@echo "installing pinned dependencies (about 1.6 GB, more if torch brings CUDA)"
-	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements-pins.txt
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-compile -r requirements-pins.txt
+	@$(COMPILE)
 	@echo "installing torchrl_etdmpc in editable mode"
 	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps -e .
 	@touch $@
