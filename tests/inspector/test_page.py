@@ -307,6 +307,9 @@ def test_a_browser_shows_the_planner_s_numbers(page, served, tmp_path):
 
     frames = wait_for(lambda: page.driver.find_elements("css selector", "#strip button"), "the filmstrip")
     assert len(frames) == 8
+    controls = page.driver.find_elements("css selector", "[role=slider], input, button:not(.hidden)")
+    unnamed = [control.get_attribute("outerHTML")[:200] for control in controls if not control.accessible_name]
+    assert len(controls) > 30 and unnamed == []  # for who hears the page
     frames[5].click()  # a state by its frame
     chosen = expected(5)
     wait_for(lambda: shows(page, chosen, "a", -1), "the plan of step 5")

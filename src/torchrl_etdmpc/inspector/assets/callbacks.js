@@ -33,3 +33,12 @@ window.dash_clientside = Object.assign({}, window.dash_clientside, {
     }
   }
 });
+
+// Dash's controls have no names of their own: those of their groups, for who hears the page.
+new MutationObserver(function () {
+  document.querySelectorAll("[role=group] [role=slider], [role=group] input:not([type=radio])").forEach(function (control) {
+    if (!control.hasAttribute("aria-label")) {
+      control.setAttribute("aria-label", control.closest("[role=group]").getAttribute("aria-label"));
+    }
+  });
+}).observe(document.documentElement, { childList: true, subtree: true });

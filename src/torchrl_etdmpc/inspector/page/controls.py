@@ -77,7 +77,7 @@ def _named(name: str, control: Any, identity: Any = None) -> Any:
     from dash import html
 
     label = html.Div(html.Span(name, **({"id": identity} if identity else {})), className="name")
-    return html.Div([label, control], className="setting")
+    return html.Div([label, control], className="setting", role="group", **{"aria-label": name})
 
 
 def _control(setting: PlannerSetting, value: Any) -> Any:

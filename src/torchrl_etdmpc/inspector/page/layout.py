@@ -53,17 +53,16 @@ def _main() -> list[Any]:
     slider: dict[str, Any] = {"marks": None, "updatemode": "drag", "allow_direct_input": False}
     scrubbing = html.Div(
         [
-            html.Label(
-                [
-                    html.Span("iteration", id="iteration-name"),
-                    html.Div(dcc.Slider(1, 1, 1, value=1, id="iteration", **slider), className="scrub"),
-                ]
-            ),
-            html.Label(
-                [
-                    html.Span("depth", id="depth-name"),
-                    html.Div(dcc.Slider(1, 1, 1, value=1, id="depth", **slider), className="scrub"),
-                ]
+            *(
+                html.Div(
+                    [
+                        html.Span(name, id=f"{name}-name"),
+                        html.Div(dcc.Slider(1, 1, 1, value=1, id=name, **slider), className="scrub"),
+                    ],
+                    role="group",
+                    **{"aria-label": name},
+                )
+                for name in ("iteration", "depth")
             ),
             html.Div(
                 [
@@ -77,7 +76,9 @@ def _main() -> list[Any]:
                         id="components",
                         inline=True,
                     ),
-                ]
+                ],
+                role="group",
+                **{"aria-label": "components"},
             ),
             html.Span("click a candidate for its return table", className="no-print"),
             html.Button("back to the chosen one", id="unclick"),
