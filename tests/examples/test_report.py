@@ -220,7 +220,7 @@ def test_tasks_of_no_benchmark_are_reported_alone_or_left_out(run_main, refused,
     assert refused("runs", "--benchmark", "dmc-easy") == "no run on a task of dmc-easy; the runs are on h1-walk."
     make_run("more/b", task="registered")
     run_main("runs", "more")
-    assert capfd.readouterr().out.startswith("2 runs on 2 tasks of Tasks without a benchmark")
+    assert capfd.readouterr().out.startswith("2 runs on 2 tasks of no benchmark")
     make_run("runs/c")
     expected = "h1-walk is of no benchmark, other runs are; report them apart, or pass --benchmark."
     assert refused("runs") == expected
@@ -335,6 +335,7 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
         (("",), "runs are PATH or NAME=PATH, and neither may be empty, got ''."),
         (("a=",), "runs are PATH or NAME=PATH, and neither may be empty, got 'a='."),
         (("=runs",), "runs are PATH or NAME=PATH, and neither may be empty, got '=runs'."),
+        (("--grid-step", "1"), "--grid-step=1 makes more than 1,000 points of "),
         (("--grid-step", "300000"), "the grid needs at least two steps"),
         (("--budget", "250000", "--grid-step", "100000"), "the budget must be a multiple of the grid step"),
     ],

@@ -30,6 +30,7 @@ REFERENCE = Path(__file__).resolve().parents[1] / "analysis" / "reference"
 DEFAULT_REFERENCES = tuple(REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget"))
 DEFAULT_GRID_STEP = 100_000
 MOST_SECONDS = 1e9  # that a process can sleep
+MOST_POINTS = 1000  # of a grid: more take minutes, and evaluations are not that dense
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -177,6 +178,11 @@ def choose_budget(
     else:
         budget = min(reached, benchmark.budget)
     if arguments.grid_step:
+        if budget // arguments.grid_step > MOST_POINTS:
+            raise ValueError(
+                f"--grid-step={arguments.grid_step} makes more than {MOST_POINTS:,} points of {budget:,} env steps; "
+                f"take {-(-budget // MOST_POINTS):,} or more."
+            )
         return budget, arguments.grid_step
     if step is None:
         first = begins(runs).max()
@@ -285,7 +291,8 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector, incomplete=incomplete)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]
     last = chosen["env_steps"].max()
-    counts = f"{count} run{'s' * (count > 1)} on {len(tasks)} task{'s' * (len(tasks) > 1)} of {benchmark.title}"
+    whose = benchmark.title if benchmark.name in BENCHMARKS else "no benchmark"
+    counts = f"{count} run{'s' * (count > 1)} on {len(tasks)} task{'s' * (len(tasks) > 1)} of {whose}"
     at = ""
     if not arguments.budget and (budget != benchmark.budget or budget < last):
         which = "which all of them reach" if budget <= reached(chosen) else "the budget of the experiment"
