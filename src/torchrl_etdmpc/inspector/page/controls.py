@@ -77,7 +77,15 @@ def _named(name: str, control: Any, identity: Any = None) -> Any:
     from dash import html
 
     label = html.Div(html.Span(name, **({"id": identity} if identity else {})), className="name")
-    return html.Div([label, control], className="setting", role="group", **{"aria-label": name})
+    return group(name, [label, control], className="setting")
+
+
+def group(name: str, content: list[Any], **options: Any) -> Any:
+    """What screen readers know by one name."""
+    from dash import html
+
+    label: dict[str, Any] = {"aria-label": name}
+    return html.Div(content, role="group", **label, **options)
 
 
 def _control(setting: PlannerSetting, value: Any) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 
 from torchrl_etdmpc.inspector import figures
 from torchrl_etdmpc.inspector.inspection import Inspection, State
-from torchrl_etdmpc.inspector.page.controls import controls
+from torchrl_etdmpc.inspector.page.controls import controls, group
 from torchrl_etdmpc.inspector.saved_page import WIDE
 
 _GRAPH: Any = {"displayModeBar": False, "responsive": False}  # inspector.js fits them
@@ -54,17 +54,17 @@ def _main() -> list[Any]:
     scrubbing = html.Div(
         [
             *(
-                html.Div(
+                group(
+                    name,
                     [
                         html.Span(name, id=f"{name}-name"),
                         html.Div(dcc.Slider(1, 1, 1, value=1, id=name, **slider), className="scrub"),
                     ],
-                    role="group",
-                    **{"aria-label": name},
                 )
                 for name in ("iteration", "depth")
             ),
-            html.Div(
+            group(
+                "components",
                 [
                     "components",
                     dcc.RadioItems(
@@ -77,8 +77,6 @@ def _main() -> list[Any]:
                         inline=True,
                     ),
                 ],
-                role="group",
-                **{"aria-label": "components"},
             ),
             html.Span("click a candidate for its return table", className="no-print"),
             html.Button("back to the chosen one", id="unclick"),
