@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 
 import numpy as np
 import pytest
@@ -114,6 +115,22 @@ def test_a_task_that_is_not_asked_how_it_is_drawn_is_made_all_the_same(recorder,
     env = make_env(recorder())
     assert env._env.render_mode is None
     assert env.rollout(2).shape == (2,)
+
+
+def test_a_task_whose_arguments_cannot_be_read_is_asked_for_its_pictures(recorder, monkeypatch):
+    """Compiled code has no signature."""
+    monkeypatch.setattr(Recorder, "metadata", {"render_modes": ["rgb_array"]})
+    monkeypatch.setattr(Recorder, "__signature__", "none", raising=False)
+    with pytest.raises(TypeError, match="unexpected object 'none' in __signature__"):
+        inspect.signature(Recorder)
+    begin = Recorder.__init__
+
+    def drawn(self, render_mode=None, **options):
+        begin(self, **options)
+        self.render_mode = render_mode
+
+    monkeypatch.setattr(Recorder, "__init__", drawn)
+    assert make_env(recorder())._env.render_mode == "rgb_array"
 
 
 def test_an_end_terminates_and_cuts_the_action_repeat_short(recorder):

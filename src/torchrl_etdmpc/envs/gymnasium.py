@@ -101,6 +101,15 @@ def gymnasium_success_return(task: Task) -> float | None:
     return gymnasium.spec(task.name.removeprefix("gym/")).reward_threshold
 
 
+def _takes_render_mode(creator: Any) -> bool:
+    """What its signature says; compiled code may have none, and is asked as gymnasium's own environments are."""
+    try:
+        parameters = inspect.signature(creator).parameters.values()
+    except (TypeError, ValueError):
+        return True
+    return any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters)
+
+
 def _make(spec: Any, task: Task, *, device: torch.device | str) -> RecordedGymnasiumEnv:
     import gymnasium
     from gymnasium.envs.registration import load_env_creator
@@ -110,8 +119,7 @@ def _make(spec: Any, task: Task, *, device: torch.device | str) -> RecordedGymna
         # To be asked for at once, by an environment that may be filmed; nothing is loaded before the first frame.
         modes = getattr(creator, "metadata", {})
         filmable = isinstance(modes, dict) and "rgb_array" in (modes.get("render_modes") or ())
-        parameters = inspect.signature(creator).parameters.values() if filmable else ()
-        filmable = any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters)
+        filmable = filmable and _takes_render_mode(creator)
         with _quiet_mujoco():
             env = gymnasium.make(
                 spec,
