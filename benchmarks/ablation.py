@@ -1,13 +1,15 @@
-"""Does the method help at the cpu preset's size? The experiment `cpu-ablation`, what is kept of its runs, its figure.
+"""Variants of the cpu preset beside it: the runs of an experiment, what is kept of them, tables and a figure.
 
     python benchmarks/ablation.py                          # 10 variants, 5 tasks, 5 seeds, 50,000 env steps: days
     python benchmarks/ablation.py --variants "all four off (BMPC)" --tasks walker-run hopper-stand --seeds 1
+    python benchmarks/ablation.py --experiment adaptive    # 5 variants, 4 tasks, 5 seeds: a day
     python benchmarks/ablation.py --report-only            # from the committed files
 
-Runs stand in `runs/cpu-ablation`, where `examples/suite.py` goes on with interrupted ones. Of finished ones
-`benchmarks/results/cpu/ablation/<variant>/<task>/seed<k>` gets `eval.csv` and `summary.json`. They are compared with
-the runs of `cpu_learning.py`, which have the same settings but for the variant's own, the same seeds and so the same
-random phase. Writes `README.md` and `differences.png` there.
+Runs stand in `runs/<experiment>`, where `examples/suite.py` goes on with interrupted ones. Of finished ones
+`benchmarks/results/cpu/<ablation or adaptive>/<variant>/<task>/seed<k>` gets `eval.csv` and `summary.json`. They are
+compared with the experiment's runs of the preset as it is, or where it has none with those of `cpu_learning.py`: same
+settings but for the variant's own, same seed and so the same random phase, ten episodes an evaluation. Writes
+`README.md` and `differences.png` there.
 """
 
 from __future__ import annotations
@@ -29,47 +31,56 @@ from scipy.stats import t as student
 from torchrl_etdmpc.analysis import read_runs
 from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import RunDirectory
-from torchrl_etdmpc.suites import read_experiment
+from torchrl_etdmpc.suites import Experiment, read_experiment
 
-FOLDER = RESULTS / "ablation"
-EXPERIMENT = ROOT / "benchmarks" / "experiments" / "cpu-ablation.yaml"
-RUNS = ROOT / "runs" / "cpu-ablation"
-BASE, ENV_STEPS = "cpu", 50_000
+KEPT = {"cpu-ablation": "ablation", "adaptive": "adaptive"}
+"""Folder below ``RESULTS`` by the name of the experiment."""
+ENV_STEPS = 50_000
 STEPS = range(10_000, ENV_STEPS + 1, 10_000)
 
 
-def collect(runs: Path) -> None:
-    """Copies what is kept of finished runs."""
+def file_of(name: str) -> Path:
+    """The experiment's file."""
+    return ROOT / "benchmarks" / "experiments" / f"{name}.yaml"
+
+
+def collect(runs: Path, folder: Path) -> None:
+    """Copies what is kept of finished runs, but for those that ``cpu_learning.py`` keeps."""
     for summary in sorted(runs.glob("*/*/seed*/summary.json")):
         source = RunDirectory(summary.parent)
         variant, task, seed = summary.parts[-4:-1]
-        if variant != BASE:
-            target = FOLDER / variant / task / seed
+        if variant != "cpu":
+            target = folder / variant / task / seed
             target.mkdir(parents=True, exist_ok=True)
             for file in (source.eval, source.summary):
                 shutil.copy(file, target)
 
 
-def read_pairs() -> pd.DataFrame:
+def read_pairs(folder: Path, base: str) -> pd.DataFrame:
     """Runs of variants that the base has with the same task and seed.
+
+    Args:
+        folder: of the kept runs.
+        base: the variant that is the preset as it is; its runs are in ``folder`` or else below ``RESULTS``.
 
     Returns:
         DataFrame: index ``variant, task, seed``; the returns of both at ``STEPS`` (columns ``variant 50000`` and
         ``base 50000`` for the last one).
     """
     rows = []
-    for folder in sorted(FOLDER.glob("*/*/seed*")):
-        variant, task, seed = folder.parts[-3:]
-        base = RESULTS / task / seed
-        if not RunDirectory(base).finished:
+    for path in sorted(folder.glob("*/*/seed*")):
+        variant, task, seed = path.parts[-3:]
+        own = folder / base / task / seed
+        beside = own if own.exists() else RESULTS / task / seed
+        if variant == base or not RunDirectory(beside).finished:
             continue
         row: dict[str, object] = {"variant": variant, "task": task, "seed": int(seed.removeprefix("seed"))}
-        for name, path in (("variant", folder), ("base", base)):
-            returns = read_runs([path]).set_index("env_steps")["return_mean"]
+        for name, run in (("variant", path), ("base", beside)):
+            returns = read_runs([run]).set_index("env_steps")["return_mean"]
             row |= {f"{name} {step}": returns[step] for step in STEPS}
         rows.append(row)
     if not rows:
-        sys.exit(f"error: no runs under {FOLDER} that {RESULTS} has too; run this script without --report-only first.")
+        sys.exit(f"error: no runs under {folder} that the preset has too; run this script without --report-only first.")
     return pd.DataFrame(rows).set_index(["variant", "task", "seed"])
 
 
@@ -81,9 +92,8 @@ def mean_over_tasks(differences: pd.Series) -> tuple[float, float]:
     return differences.mean(), student.ppf(0.975, count - 1) * differences.std() / count**0.5
 
 
-def groups(tasks: pd.Index) -> dict[str, pd.Index]:
+def groups(tasks: pd.Index, chosen: Sequence[str]) -> dict[str, pd.Index]:
     """All tasks; those of the experiment, those that the preset was tuned on and the others, where that is a part."""
-    chosen = read_experiment(EXPERIMENT).tasks
     parts = {
         "all": tasks,
         "those of the experiment": tasks[tasks.isin(chosen)],
@@ -93,17 +103,18 @@ def groups(tasks: pd.Index) -> dict[str, pd.Index]:
     return {name: part for name, part in parts.items() if name == "all" or 0 < len(part) < len(tasks)}
 
 
-def report(pairs: pd.DataFrame) -> str:
+def report(pairs: pd.DataFrame, experiment: Experiment) -> str:
     """Tables of every variant."""
-    lines = ["# Does the method help at this size?", "", *__doc__.strip().split("\n\n")[-1].splitlines(), ""]
+    lines = [f"# {experiment.title}", "", *__doc__.strip().split("\n\n")[-1].splitlines(), ""]
     lines += [
-        "A difference is the variant's return minus the preset's, of runs with the same task and seed, ten episodes",
-        "each; above 0 the variant is ahead. In brackets the 95% interval of the mean over tasks (Student's t over one",
+        f"A difference is the variant's return minus that of *{experiment.base}*, of runs with the same task and seed;",
+        "above 0 the variant is ahead. In brackets the 95% interval of the mean over tasks (Student's t over one",
         "difference per task): it says what other tasks of this kind would show, not what other seeds would.",
         f"{', '.join(TASKS[:-1])} and {TASKS[-1]} are those that the preset was tuned on.",
         "",
     ]
-    for variant, rows in pairs.groupby("variant", sort=False):
+    for variant in in_order(pairs, experiment):
+        rows = pairs.xs(variant, level="variant")
         by_task = rows.groupby("task").mean()
         lines += [
             f"## {variant}",
@@ -111,7 +122,7 @@ def report(pairs: pd.DataFrame) -> str:
             "| mean over tasks | tasks | " + " | ".join(f"{step:,}" for step in STEPS) + " |",
         ]
         lines += ["|---|---" + "|---" * len(STEPS) + "|"]
-        for name, tasks in groups(by_task.index).items():
+        for name, tasks in groups(by_task.index, experiment.tasks).items():
             cells = []
             for step in STEPS:
                 mean, half = mean_over_tasks(by_task.loc[tasks, f"variant {step}"] - by_task.loc[tasks, f"base {step}"])
@@ -119,7 +130,7 @@ def report(pairs: pd.DataFrame) -> str:
             lines.append(f"| {name} | {len(tasks)} | {' | '.join(cells)} |")
         lines += [
             "",
-            f"| task | seeds | {BASE} at {ENV_STEPS:,} | variant | difference |",
+            f"| task | seeds | {experiment.base} at {ENV_STEPS:,} | variant | difference |",
             "|---|---|---|---|---|",
         ]
         for task, seeds in rows.groupby("task"):
@@ -128,12 +139,34 @@ def report(pairs: pd.DataFrame) -> str:
             numbers = ", ".join(map(str, sorted(seeds.index.get_level_values("seed"))))
             lines.append(f"| {task} | {numbers} | {ours:.0f} | {theirs:.0f} | {theirs - ours:+.0f} |")
         lines.append("")
-    return "\n".join([*lines, "![differences](differences.png)", ""])
+    return "\n".join([*lines, *returns_table(pairs, experiment), "", "![differences](differences.png)", ""])
 
 
-def draw(pairs: pd.DataFrame) -> Figure:
+def returns_table(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
+    """Returns by task and variant, means over the seeds that are there."""
+    lines = ["## Returns", "", f"| task | variant | seeds | {' | '.join(f'{step:,}' for step in STEPS)} |"]
+    lines += ["|---|---|---" + "|---" * len(STEPS) + "|"]
+    for task, rows in pairs.groupby("task"):
+        bases = rows[[f"base {step}" for step in STEPS]].groupby("seed").first()
+        found = {experiment.base: bases} | {
+            variant: rows.xs(variant, level="variant")[[f"variant {step}" for step in STEPS]].droplevel("task")
+            for variant in in_order(rows, experiment)
+        }
+        for variant, returns in found.items():
+            numbers = ", ".join(map(str, sorted(returns.index)))
+            cells = " | ".join(f"{mean:.0f}" for mean in returns.mean())
+            lines.append(f"| {task if variant == experiment.base else ''} | {variant} | {numbers} | {cells} |")
+    return lines
+
+
+def in_order(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
+    """Those variants that are there, as the experiment has them."""
+    return [variant for variant in experiment.variants if variant in pairs.index.unique("variant")]
+
+
+def draw(pairs: pd.DataFrame, experiment: Experiment) -> Figure:
     """A panel for each variant: the difference on every task, and where there are several their mean."""
-    variants, tasks = list(pairs.index.unique("variant")), sorted(pairs.index.unique("task"), reverse=True)
+    variants, tasks = in_order(pairs, experiment), sorted(pairs.index.unique("task"), reverse=True)
     figure = Figure(figsize=(1.6 + 2.6 * len(variants), 0.26 * len(tasks) + 1.5), layout="constrained")
     axes = figure.subplots(1, len(variants), squeeze=False, sharex=True, sharey=True)[0]
     for axis, variant in zip(axes, variants, strict=True):
@@ -150,33 +183,35 @@ def draw(pairs: pd.DataFrame) -> Figure:
         axis.grid(axis="x", alpha=0.3)
     names = [f"{task} (tuned on)" if task in TASKS else task for task in tasks]
     axes[0].set_yticks(range(len(tasks) + 1), ["mean, 95% interval", *names])
-    figure.supxlabel(f"return minus the preset's at {ENV_STEPS:,} env steps", fontsize=10)
+    figure.supxlabel(f"return minus that of {experiment.base} at {ENV_STEPS:,} env steps", fontsize=10)
     return figure
 
 
-def train(variants: Sequence[str], tasks: Sequence[str], seeds: Sequence[int], runs: Path) -> None:
+def train(file: Path, variants: Sequence[str], tasks: Sequence[str], seeds: Sequence[int], runs: Path) -> None:
     """The runs of the experiment that are missing."""
-    command = [sys.executable, str(ROOT / "examples" / "suite.py"), f"experiment={EXPERIMENT}", f"runs_dir={runs}"]
+    command = [sys.executable, str(ROOT / "examples" / "suite.py"), f"experiment={file}", f"runs_dir={runs}"]
     command += [f"variants={','.join(variants)}", f"tasks={','.join(tasks)}", f"seeds={list(seeds)}"]
     subprocess.run(command, check=True)
 
 
 def main() -> None:
-    experiment = read_experiment(EXPERIMENT)
-    others = [variant for variant in experiment.variants if variant != BASE]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--variants", nargs="+", default=others, choices=others, metavar="VARIANT")
-    parser.add_argument("--tasks", nargs="+", default=list(experiment.tasks), choices=DMC_TASKS, metavar="TASK")
+    parser.add_argument("--experiment", default="cpu-ablation", choices=KEPT)
+    parser.add_argument("--variants", nargs="+", metavar="VARIANT", help="default: all but the preset as it is")
+    parser.add_argument("--tasks", nargs="+", choices=DMC_TASKS, metavar="TASK", help="default: the experiment's")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
-    parser.add_argument("--runs", type=Path, default=RUNS, help="folder of the experiment's runs")
+    parser.add_argument("--runs", type=Path, help="folder of the runs; default: runs/<experiment>")
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
+    experiment, folder = read_experiment(file_of(arguments.experiment)), RESULTS / KEPT[arguments.experiment]
     if not arguments.report_only:
-        train(arguments.variants, arguments.tasks, arguments.seeds, arguments.runs)
-        collect(arguments.runs)
-    pairs = read_pairs()
-    (FOLDER / "README.md").write_text(report(pairs))
-    draw(pairs).savefig(FOLDER / "differences.png", dpi=120)
+        variants = arguments.variants or [name for name in experiment.variants if name != experiment.base]
+        runs = arguments.runs or ROOT / "runs" / arguments.experiment
+        train(file_of(arguments.experiment), variants, arguments.tasks or experiment.tasks, arguments.seeds, runs)
+        collect(runs, folder)
+    pairs = read_pairs(folder, experiment.base)
+    (folder / "README.md").write_text(report(pairs, experiment))
+    draw(pairs, experiment).savefig(folder / "differences.png", dpi=120)
 
 
 if __name__ == "__main__":

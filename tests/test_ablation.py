@@ -28,7 +28,6 @@ def script(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(BENCHMARKS)
     module = importlib.import_module("ablation")
     monkeypatch.setattr(module, "RESULTS", tmp_path)
-    monkeypatch.setattr(module, "FOLDER", tmp_path / "ablation")
     return module
 
 
@@ -55,8 +54,9 @@ def test_runs_are_paired_by_task_and_seed_and_tasks_count_alike(script, tmp_path
 def test_what_is_kept_of_the_experiment_s_runs_leaves_the_base_out(script, tmp_path):
     for variant in ("cpu", "no reanalyze"):
         write(tmp_path / "runs" / variant / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
-    script.collect(tmp_path / "runs")
-    found = sorted(str(file.relative_to(script.FOLDER)) for file in script.FOLDER.rglob("*") if file.is_file())
+    kept = tmp_path / "ablation"
+    script.collect(tmp_path / "runs", kept)
+    found = sorted(str(file.relative_to(kept)) for file in kept.rglob("*") if file.is_file())
     assert found == [f"no reanalyze/walker-run/seed1/{name}" for name in ("eval.csv", "summary.json")]
 
 
@@ -64,3 +64,20 @@ def test_without_a_pair_there_is_one_line(script, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only"])
     with pytest.raises(SystemExit, match=r"^error: no runs under .* run this script without --report-only first\.$"):
         script.main()
+
+
+def test_a_base_of_the_experiment_s_own_goes_before_the_preset_s_run(script, tmp_path, monkeypatch):
+    steps = list(script.STEPS)
+    for seed, value in ((1, 100.0), (2, 200.0)):
+        write(tmp_path / "walker-run" / f"seed{seed}", dict.fromkeys(steps, value))
+        write(tmp_path / "adaptive" / "final" / "walker-run" / f"seed{seed}", dict.fromkeys(steps, 500.0))
+    write(tmp_path / "adaptive" / "mean" / "walker-run" / "seed1", dict.fromkeys(steps, 400.0))
+    write(tmp_path / "adaptive" / "adaptive beta 0" / "walker-run" / "seed2", dict.fromkeys(steps, 260.0))
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only", "--experiment", "adaptive"])
+    script.main()
+    page = (tmp_path / "adaptive" / "README.md").read_text()
+    assert page.startswith("# Does it pay to choose the planning depth?")
+    assert "| walker-run | 1, 2 | 300 | 500 | +200 |" in page  # 400 of its own, 200 of the preset's run
+    table = page[page.index("## Returns") :]
+    assert "| walker-run | mean | 1, 2 | 300 | 300 | 300 | 300 | 300 |" in table
+    assert table.index("|  | final | 1, 2 | 500 |") < table.index("|  | adaptive beta 0 | 2 | 260 |")
