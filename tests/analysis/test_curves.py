@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -142,6 +143,27 @@ def test_runs_behind_links_are_found_and_each_of_them_once(tmp_path):
     (runs / "a").symlink_to(runs / "c")
     (runs / "c" / "back").symlink_to(runs)
     assert find_runs([runs]) == [runs / "b", runs / "c"]
+
+
+def test_what_cannot_be_looked_into_is_found_so_that_its_reader_says_why(tmp_path, monkeypatch):
+    for seed in (1, 2):
+        make_run(tmp_path / f"seed{seed}", HEADER)
+    (tmp_path / "seed3").symlink_to(tmp_path / "not mounted")
+    (tmp_path / "seed1" / "checkpoints").mkdir()
+    (tmp_path / "seed1" / "checkpoints" / "best").symlink_to(tmp_path / "gone")  # is no run
+    assert find_runs([tmp_path]) == [tmp_path / f"seed{seed}" for seed in (1, 2, 3)]
+    with pytest.raises(FileNotFoundError):
+        Run.read(tmp_path / "seed3")
+
+    scan = os.scandir  # by which os.walk looks; permissions do not stop everybody
+
+    def refusing(folder):
+        if Path(folder) == tmp_path / "seed2":
+            raise PermissionError(13, "Permission denied", str(folder))
+        return scan(folder)
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    assert find_runs([tmp_path]) == [tmp_path / f"seed{seed}" for seed in (1, 2, 3)]
 
 
 def test_a_path_that_does_not_exist_is_an_error(tmp_path):

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import copy
+
 import torch
 
 from torchrl_etdmpc.functional import simnorm
-from torchrl_etdmpc.modules import DynamicsEnsemble, Encoder, GaussianPolicy, ValueEnsemble
+from torchrl_etdmpc.modules import DynamicsEnsemble, Encoder, GaussianPolicy, ValueEnsemble, WorldModel
 
 O, A, L = 5, 2, 16  # noqa: E741
 
@@ -135,3 +137,25 @@ def test_the_networks_work_outside_a_world_model():
     mean, log_std = GaussianPolicy(L, A, hidden_dim=8, log_std_min=0.0, log_std_max=0.5)(latent)
     assert ((log_std > 0) & (log_std < 0.5)).all()
     assert mean.shape == (7, A)
+
+
+def test_bins_come_back_from_half_precision_as_they_were():
+    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16, bin_min=-7.3, bin_max=5.0)
+    exact = model.bins.clone()
+    model.to(torch.bfloat16)
+    assert model.bins.dtype == torch.bfloat16
+    assert not torch.equal(model.bins.float(), exact)
+    rounded = copy.deepcopy(model.state_dict())
+    model.float()
+    assert torch.equal(model.bins, exact)
+    model.load_state_dict(rounded)
+    assert torch.equal(model.bins, exact)
+
+
+def test_bins_of_a_state_with_other_ends_are_taken_over_for_good():
+    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
+    other = WorldModel(3, 2, latent_dim=16, mlp_dim=16, bin_min=-5.0, bin_max=8.0)
+    model.load_state_dict(other.state_dict())
+    model.to(torch.float16).float()
+    model.reset_parameters_recursive()
+    assert torch.equal(model.bins, other.bins)

@@ -348,3 +348,9 @@ def test_a_coefficient_of_the_method_is_not_negative(world_model, name):
     for kind, model in ((EfficientTDMPCLoss, world_model), (TDMPC2Loss, with_actions)):
         with pytest.raises(ValueError, match=rf"^{name}_coef must not be negative, got -1\.0; 0 leaves"):
             kind(model, discount=0.99, **{f"{name}_coef": -1.0})
+
+
+def test_a_metric_cannot_be_called_as_the_priorities_are(make_world_model):
+    term = Term("mine", lambda world_model, slices, rollout: slices.reward, metrics=("priority",))
+    with pytest.raises(ValueError, match=r"^metrics and scalars must have names of their own, got 'priority'"):
+        EfficientTDMPCLoss(make_world_model(), discount=0.99, extra_terms=[term])

@@ -116,3 +116,17 @@ def test_out_keys_can_be_selected(loss, kind, slices, run_seeded, keywords_of, t
     loss.reset_out_keys()
     assert loss.out_keys == all_keys
     assert set(loss(slices).keys()) == set(all_keys)
+
+
+def test_selected_keys_follow_distill_and_are_taken_back_whole(make_loss, make_world_model, make_slices):
+    loss, slices = make_loss("whole", make_world_model()), make_slices()
+    everything = loss.out_keys
+    loss.select_out_keys("loss_value", "loss_policy")
+    loss.distill = False
+    assert loss.out_keys == ["loss_value"]
+    assert list(loss(slices).keys()) == ["loss_value"]
+    loss.reset_out_keys()
+    assert "loss_policy" not in loss.out_keys
+    loss.distill = True
+    assert loss.out_keys == everything
+    assert set(loss(slices).keys()) == set(everything)

@@ -304,3 +304,19 @@ def test_a_plan_without_a_deviation_in_one_dimension_is_none(make_loss, slices):
     assert loss.isfinite().all()
     assert loss[0, 0] == 0
     assert (loss != 0).sum() == loss.numel() - 1
+
+
+def test_what_stands_in_the_place_of_a_missing_plan_does_not_matter(make_loss, make_world_model, make_slices):
+    found = []
+    for value in (0.0, float("nan")):
+        torch.manual_seed(0)
+        loss = make_loss("policy", make_world_model())
+        slices = make_slices()
+        slices["plan", "scale"][0] = 0
+        slices["plan", "loc"][0] = value
+        torch.manual_seed(0)
+        out = loss(slices)
+        found.append(torch.autograd.grad(out["loss_policy"], [*loss.parameters()], allow_unused=True))
+    for expected, gradient in zip(*found, strict=True):
+        assert (gradient is None) == (expected is None)
+        assert gradient is None or torch.equal(gradient, expected)

@@ -159,3 +159,23 @@ def test_torchrl_s_prioritised_slices_are_drawn_by_the_errors_that_the_loss_writ
         errors = starts["td_error"].reshape(-1)
         torch.testing.assert_close(stored[once].float(), errors[once], rtol=1e-4, atol=1e-6)
         assert errors.unique().numel() > 1
+
+
+def test_one_weight_for_each_slice_will_do_and_other_numbers_are_refused(make_loss, make_world_model, make_slices):
+    loss, slices = make_loss("whole", make_world_model()).eval(), make_slices()
+    weights = torch.rand(slices.batch_size[0])
+    found = []
+    for shape in ((-1, 1), (-1,)):
+        data = slices.clone()
+        data.batch_size = data.batch_size[:1]
+        data["priority_weight"] = weights.reshape(shape)
+        torch.manual_seed(0)
+        found.append(loss(data)["loss_value"])
+    wide = slices.clone()
+    wide["priority_weight"] = weights[:, None].expand(wide.batch_size)
+    torch.manual_seed(0)
+    torch.testing.assert_close(loss(wide)["loss_value"], found[0])
+    assert torch.equal(*found)
+    data["priority_weight"] = torch.rand(len(weights), 2)
+    with pytest.raises(ValueError, match=r"needs one weight for each slice or each step at 'priority_weight'"):
+        loss(data)

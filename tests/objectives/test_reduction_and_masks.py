@@ -4,11 +4,16 @@ import copy
 
 import pytest
 import torch
+from tensordict import LazyStackedTensorDict, TensorDict
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
+from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc import EfficientTDMPCLoss, EnsembleMPPIPlanner, LatentEnv, WorldModel
 from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.functional import simnorm
+from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
 
 
@@ -158,8 +163,8 @@ def test_a_mask_of_ones_changes_nothing(loss, slices, run_seeded, assert_same_ou
 
 
 def test_an_update_reads_the_mask_too(make_loss, make_world_model, slices):
-    model = make_world_model()
-    updaters = [Updater(make_loss("whole", copy.deepcopy(model))) for _ in range(2)]
+    loss = make_loss("whole", make_world_model())
+    updaters = [Updater(copy.deepcopy(loss)) for _ in range(2)]
     for updater, fill in zip(updaters, (0.5, float("nan")), strict=True):
         torch.manual_seed(3)
         out = updater.step(_pad(slices, fill))
@@ -260,3 +265,28 @@ def test_a_term_of_one_s_own_finds_a_scale_that_it_can_divide_by_in_padded_steps
     read = make_loss("whole", world_model).slices(_pad(slices, 0.0))
     assert (read.plan_scale[~read.counts] == 1).all()
     assert (read.action[~read.counts] == 0).all()
+
+
+@pytest.mark.parametrize("stack_dim", [0, 1])
+def test_masks_lie_over_the_steps_of_dictionaries_that_are_stacked_lazily(stack_dim):
+    class First(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = nn.Linear(3, 16)
+
+        def forward(self, observation):
+            return simnorm(self.layer(observation["inner", "state"]), 8)
+
+    torch.manual_seed(0)
+    loss = EfficientTDMPCLoss(WorldModel(None, 2, encoder=First(), latent_dim=16, mlp_dim=16), discount=0.99).eval()
+    SoftUpdate(loss, tau=0.01)
+    dense = random_slices(3, 2, num_slices=3, slice_len=3)  # three of everything: no shape tells them apart
+    for key in ("observation", ("next", "observation")):
+        dense[key] = TensorDict({"inner": {"state": dense[key]}}, dense.batch_size)
+    dense["collector", "mask"] = torch.tensor([[True, False, False], [True, True, False], [True, True, True]])
+    found = []
+    for batch in (dense, LazyStackedTensorDict(*dense.unbind(stack_dim), stack_dim=stack_dim)):
+        torch.manual_seed(0)
+        found.append(loss(batch))
+    for name, value in found[0].items():
+        assert torch.equal(found[1][name], value), name

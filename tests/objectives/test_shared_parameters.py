@@ -167,7 +167,7 @@ def test_weights_that_others_took_the_place_of_are_noticed(make_loss, make_world
     # A layer, not the first one.
     other = make_world_model()
     loss.world_model.reward_head.output = other.reward_head.output
-    with pytest.raises(RuntimeError, match=r"world_model\.reward_head are others .* to_module\(\) of the loss put"):
+    with pytest.raises(RuntimeError, match=r"world_model\.reward_head are others .* to_module\(\) put"):
         loss(slices)
 
 

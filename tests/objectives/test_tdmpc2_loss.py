@@ -392,3 +392,23 @@ def test_tdmpc2_takes_terms_of_one_s_own():
     term = Term("mine", lambda model, slices, rollout: slices.action.square().mean(-1))
     loss, batch = make_loss(extra_terms=[term]), random_slices(O, A)
     torch.testing.assert_close(loss(batch)["mine_error"], batch["action"].square().mean())
+
+
+def test_a_term_that_reads_ends_does_not_end_the_bootstrap(batch):
+    def ends(world_model, slices, rollout):
+        return slices.terminated.float()
+
+    found = []
+    for terms in ([], [Term("ends", ends, keys=("terminated",))]):
+        torch.manual_seed(0)
+        world_model = ActionValueWorldModel(3, 2, latent_dim=16, mlp_dim=16)
+        with torch.no_grad():
+            for parameter in world_model.parameters():
+                parameter.add_(0.3 * torch.randn_like(parameter))
+        loss = TDMPC2Loss(world_model, discount=0.99, ignore_termination=True, extra_terms=terms)
+        SoftUpdate(loss, tau=0.01)
+        data = random_slices(3, 2, terminated=True)
+        data["next", "terminated"][:] = True
+        torch.manual_seed(0)
+        found.append(loss.eval()(data)["value_target"])
+    assert torch.equal(*found)

@@ -9,7 +9,7 @@ import torch
 from torchrl.checkpoint import Checkpoint
 from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss, EfficientTDMPCPolicyLoss
+from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss, EfficientTDMPCPolicyLoss, update_count
 from torchrl_etdmpc.training import Updater
 
 
@@ -196,3 +196,12 @@ def test_an_optimizer_beside_the_one_that_counts_does_not(make_loss, world_model
     assert world_model.version == 4
     train(loss, whole, policy, slices=slices, total=total)
     assert world_model.version == 7
+
+
+def test_the_count_stays_in_its_memory_for_graphs_that_read_it(loss, world_model, slices, total):
+    optimizer = torch.optim.SGD(loss.parameters())
+    train(loss, optimizer, slices=slices, total=total, steps=1)
+    memory = update_count._counts[world_model].after
+    train(loss, optimizer, slices=slices, total=total, steps=2)
+    assert update_count._counts[world_model].after is memory
+    assert memory == world_model.version == 3

@@ -52,6 +52,10 @@ def test_what_is_written_is_read_again(write, tmp_path):
     write_experiment(experiment, tmp_path / "mine.yaml")
     assert read_experiment(tmp_path / "mine.yaml") == experiment
     assert experiment.searches["tuned"].settings == {"loss.rho": 0.4}
+    # PyYAML writes these without quotes, as texts, which the loader takes for numbers.
+    rates = dataclasses.replace(experiment, variants={"1e-3": {}, "3E4": {}}, base="1e-3")
+    write_experiment(rates, tmp_path / "rates.yaml")
+    assert read_experiment(tmp_path / "rates.yaml").variants == rates.variants
 
 
 @pytest.mark.parametrize("spelling", ["action_repeat", "task.action_repeat", "nested"])

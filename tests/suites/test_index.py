@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import math
 import os
 import sqlite3
@@ -10,6 +11,7 @@ import time
 
 import pytest
 
+from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.suites import Progress, RunIndex, index, read_progress, status_text
 from torchrl_etdmpc.suites.attempt import note
 
@@ -49,6 +51,13 @@ def test_a_run_is_what_its_directory_says(runs, small):
     assert read_progress(failed) == Progress("failed", 100, 500.0, 20.0, "the simulator is gone")
     note(stopped, "pruned", "below the median")
     assert read_progress(stopped).state == "pruned"
+
+
+def test_a_run_whose_last_evaluation_failed_has_no_return(runs, small):
+    small.write_finished(runs[0], returns=321.0)
+    file = RunDirectory(runs[0].path).summary
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"final_return": None}))
+    assert math.isnan(read_progress(runs[0]).latest_return)
 
 
 def test_a_run_is_finished_only_at_the_budget_that_is_asked_for(runs, small, tmp_path):

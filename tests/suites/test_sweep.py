@@ -228,6 +228,21 @@ def test_a_trial_below_the_median_of_five_ends_early(search, small, tmp_path):
     assert [run.name for run in sweep.runs()] == [run.name for run in good]
 
 
+def test_trials_that_ended_unseen_count_in_the_median(search, small, tmp_path):
+    sweep = Sweep(search(trials=7), "tuned", tmp_path)
+    for returns in (900.0, 100.0, 100.0, 100.0, 100.0):
+        (run,) = sweep.propose()
+        if returns == 900:
+            small.write_tables(run, 100, returns=returns)
+            assert sweep.look() == []
+        small.write_finished(run, returns=returns)  # in no process's sight, as after a kill
+        assert sweep.look() == []
+    assert study_of(tmp_path).trials[4].intermediate_values == dict.fromkeys((100, 200, 300), 100.0)
+    (run,) = sweep.propose()
+    small.write_tables(run, 400, returns=500.0)
+    assert sweep.look() == []  # far above the median, though not above the only one that was seen
+
+
 def test_the_evaluation_at_the_end_ends_no_trial_early(search, small, tmp_path):
     sweep = Sweep(search(trials=1), "tuned", tmp_path)
     (run,) = sweep.propose()

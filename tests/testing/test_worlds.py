@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_etdmpc import LatentEnv, WorldModel
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel
 from torchrl_etdmpc.functional import ensemble_mean, ensemble_variance, return_table
 from torchrl_etdmpc.testing import AnalyticWorld, LineWorld, LQRWorld
 
@@ -230,3 +230,11 @@ def test_the_policy_obeys_other_bounds_of_its_log_std():
 def test_an_impossible_world_is_refused(options, message):
     with pytest.raises(ValueError, match=f"^{message}$"):
         LineWorld(**options)
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float64"])
+def test_a_world_of_matrices_is_scored_in_any_dtype(dtype):
+    planner = EnsembleMPPIPlanner(
+        LatentEnv(LQRWorld()), horizon=2, num_samples=16, num_elites=4, num_proposals=2, scoring_dtype=dtype
+    )
+    assert planner.plan(torch.tensor([[0.2, -0.1]])).value.isfinite().all()

@@ -770,3 +770,37 @@ def test_warming_up_leaves_weights_scale_statistics_and_distillation_as_they_are
     assert not loss.distill
     for name, value in snapshot(updater).items():
         assert torch.equal(value, before[name]), name
+
+
+def test_a_new_updater_leaves_the_targets_where_they_are():
+    updater = make_updater()
+    for _ in range(3):
+        updater.step(make_batch())
+    state = copy.deepcopy(updater.loss.state_dict())
+    again = EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True)
+    again.load_state_dict(state)
+    for loss in (again, updater.loss):
+        Updater(loss)
+        assert all(torch.equal(value, state[name]) for name, value in loss.state_dict().items())
+    targets = {name: value for name, value in state.items() if name.startswith("target_value")}
+    assert targets
+    assert not all(torch.equal(value, state[name.removeprefix("target_")]) for name, value in targets.items())
+
+
+def test_a_state_with_a_schedule_needs_one_and_brings_its_rates():
+    def make(lr, **options):
+        loss = EfficientTDMPCLoss(make_world_model(), discount=0.9, ignore_termination=True)
+        return Updater(loss, lr=lr, **options)
+
+    updater = make(1e-3, lr_halved_after=2)
+    for _ in range(2):
+        updater.step(make_batch())
+    state = copy.deepcopy(updater.state_dict())
+    with pytest.raises(ValueError, match=r"^the state is of an updater with lr_halved_after; build this one with it"):
+        make(1e-3).load_state_dict(state)
+    other = make(5e-2, lr_halved_after=2)
+    other.load_state_dict(state)
+    for _ in range(2):
+        for each in (updater, other):
+            each.step(make_batch())
+        assert [g["lr"] for g in other.optimizer.param_groups] == [g["lr"] for g in updater.optimizer.param_groups]

@@ -72,9 +72,17 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
 
 
 def _folders_with(name: str, path: Path) -> set[Path]:
-    """Also behind links to folders, each of them once."""
-    found, seen = {}, set()
-    for folder, folders, files in os.walk(path, followlinks=True):
+    """Also behind links to folders, each of them once.
+
+    What cannot be looked into is among them, and so are links that lead nowhere and stand beside a run: who reads them
+    learns why not.
+    """
+    found, seen, nowhere = {}, set(), []
+
+    def refused(error: OSError) -> None:
+        found[str(error.filename)] = Path(error.filename)
+
+    for folder, folders, files in os.walk(path, followlinks=True, onerror=refused):
         folders.sort(key=lambda inner: (os.path.islink(os.path.join(folder, inner)), inner))  # links come last
         real = os.path.realpath(folder)
         if real in seen:  # a link that leads back
@@ -83,7 +91,9 @@ def _folders_with(name: str, path: Path) -> set[Path]:
         seen.add(real)
         if name in files:
             found[real] = Path(folder)
-    return set(found.values())
+        nowhere += [Path(folder, file) for file in files if not os.path.exists(os.path.join(folder, file))]
+    beside = {run.parent for run in found.values()}
+    return set(found.values()).union(link for link in nowhere if link.parent in beside)
 
 
 @dataclass(frozen=True)

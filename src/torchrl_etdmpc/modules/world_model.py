@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -187,8 +188,31 @@ class WorldModel(nn.Module):
         """Draws new weights in every network (the hook that TorchRL's losses call)."""
         for network in self.children():
             draw_new_weights(network)
-        self.bins.copy_(torch.linspace(*self._bin_ends, len(self.bins)))  # made on the meta device they have no values
+        self._place_bins()  # made on the meta device they have no values
         self.version.zero_()
+
+    def _place_bins(self) -> None:
+        """Puts them where they belong, as exactly as their dtype can say."""
+        exact = torch.linspace(*self._bin_ends, len(self.bins), dtype=torch.float64, device="cpu")
+        if self.bins.dtype != torch.float64:
+            exact = torch.linspace(*self._bin_ends, len(self.bins), dtype=torch.float32, device="cpu")
+        self.bins.copy_(exact)
+
+    def _apply(self, fn, recurse: bool = True):
+        super()._apply(fn, recurse)
+        if not self.bins.is_meta:  # a cast to half precision and back would leave them rounded
+            self._place_bins()
+        return self
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        if f"{prefix}bins" not in state_dict or self.bins.is_meta:
+            return
+        ends = state_dict[f"{prefix}bins"][[0, -1]].tolist()
+        # Weights and bins belong together; those of a state in half precision are rounded to within 2^-8.
+        if not all(math.isclose(*pair, rel_tol=2**-8) for pair in zip(ends, self._bin_ends, strict=True)):
+            self._bin_ends = (ends[0], ends[1])
+        self._place_bins()
 
     def encode(self, observation: Any) -> Tensor:
         """Observation ``[..., O]``, or whatever the encoder takes with a leading batch, to latent ``[..., L]``."""

@@ -170,7 +170,7 @@ def _action_value(
         values,
         rollout.encoded[1:],
         slices.reward,
-        slices.terminated,
+        slices.terminated if world_model.termination_head is not None else None,  # a term of one's own may read it
         torch.randn_like(slices.action),
         draw_two_heads(world_model.num_values, slices.action.device),
         loss.discount,

@@ -242,14 +242,19 @@ class LatentRolloutLoss(SharedNetworksLoss):
     @property
     def out_keys(self) -> list[str]:
         """Keys that ``forward`` returns: the ``loss_*`` terms, then the metrics."""
-        if self._out_keys is None:
-            terms = self.active_terms
-            return [f"loss_{term.name}" for term in terms] + [name for term in terms for name in term.metric_names]
-        return self._out_keys
+        terms = self.active_terms
+        written = [f"loss_{term.name}" for term in terms] + [name for term in terms for name in term.metric_names]
+        return written if self._out_keys is None else [key for key in self._out_keys if key in written]
 
     @out_keys.setter
     def out_keys(self, keys: list[str]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._out_keys = keys
+
+    def reset_out_keys(self) -> LatentRolloutLoss:
+        """Takes back ``select_out_keys``."""
+        super().reset_out_keys()
+        self._out_keys = None  # the base class hands back those of when they were selected
+        return self
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones.
@@ -318,7 +323,7 @@ class LatentRolloutLoss(SharedNetworksLoss):
         terms = self.evaluate(self.slices(tensordict), self.targets(), self.reduction)
         self.write_priority(tensordict, terms)
         unread = self._parameters_without_a_term()
-        if unread and dist.is_available() and dist.is_initialized():
+        if unread and terms and dist.is_available() and dist.is_initialized():
             # DistributedDataParallel waits for a gradient of every parameter and cannot look for those without one in a
             # TensorDict. Nobody sees this zero, and the gradient of these parameters is one.
             name = next(iter(terms))

@@ -159,8 +159,9 @@ def _policy(
     latent = head_rows(rollout.predicted[:-1])
     # Random actions of a collector have no plan, and zeros in its place: a scale of zero would make every gradient NaN.
     planned = ~(slices.plan_scale <= 0).any(-1)  # what is no number is no missing plan either
+    plan_loc = torch.where(planned.unsqueeze(-1), slices.plan_loc, 0)
     plan_scale = torch.where(planned.unsqueeze(-1), slices.plan_scale, 1)
-    plan = head_rows(slices.plan_loc, heads), head_rows(plan_scale, heads)
+    plan = head_rows(plan_loc, heads), head_rows(plan_scale, heads)
     kl, entropy = distillation(world_model, latent, *plan, kl_direction=loss.kl_direction)
     counts = planned if slices.counts is None else planned & slices.counts
     # Departure from BMPC, which moves the scale in every policy step: an evaluation of the loss must not change it.

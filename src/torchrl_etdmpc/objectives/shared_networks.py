@@ -182,8 +182,8 @@ class SharedNetworksLoss(LossModule):
             if now is not first or {id(parameter) for parameter in network.parameters()} != self._trained[name][1]:
                 raise RuntimeError(
                     f"the weights of world_model.{attribute} are others than this loss trains: load_state_dict("
-                    "assign=True), a new module or layer and to_module() of the loss put other parameters there; load "
-                    "without assign, build the loss and its optimizer afterwards, or swap those of the world model."
+                    "assign=True), a new module or layer and to_module() put other parameters there; load without "
+                    "assign, build the loss and its optimizer afterwards, and end a swap before the loss is called."
                 )
             target: Any = self._modules.get(f"target_{name}_params")
             if target is None or now is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
 from torchrl_etdmpc.keys import DONE, NEXT
@@ -121,7 +121,12 @@ class SliceReader:
         if weights is not None:
             # One weight per slice: that of its first row, which the sampler drew.
             steps, slices = fields["action"].shape[:2]
-            weights = weights.reshape(slices, steps)[:, 0].expand(steps, slices).to(fields["action"].dtype)
+            if weights.numel() not in (slices, slices * steps):
+                raise ValueError(
+                    f"{self.owner} needs one weight for each slice or each step at {self.weight_key!r}, here "
+                    f"[{slices}, {steps}], got {list(weights.shape)}."
+                )
+            weights = weights.reshape(slices, -1)[:, 0].expand(steps, slices).to(fields["action"].dtype)
         return Slices(**fields, counts=counts, weights=weights, prioritised=prioritised, extra=entries or None)
 
     def _entry(self, tensordict: TensorDictBase, name: NestedKey, key: NestedKey) -> Tensor | TensorDictBase:
@@ -222,6 +227,7 @@ class SliceReader:
 
 def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:
     """The entry ``[B, T, ...]``, or each of a dictionary, where the step counts, and harmless values elsewhere."""
-    if isinstance(entry, TensorDictBase):
-        return entry.apply(lambda value: _where(counts, value, harmless))
+    if is_tensor_collection(entry):
+        # A lazy stack would hand out its entries one by one, without the dimension that they are stacked in.
+        return entry.contiguous().apply(lambda value: _where(counts, value, harmless))
     return torch.where(counts.view(*counts.shape, *(1,) * (entry.ndim - 2)), entry, harmless(entry))

@@ -142,7 +142,7 @@ def check_terms(
             raise ValueError(f"{argument} must have names of their own, got {term.name!r}; choose another one.")
         taken |= {term.name, f"{term.name}_coef"}
         for name in (*term.scalars, *term.metric_names):
-            if _is_taken(name, taken.union(networks)) or name.startswith("loss_"):
+            if _is_taken(name, taken.union(networks)) or name.startswith("loss_") or name == PRIORITY:
                 raise ValueError(
                     f"metrics and scalars must have names of their own, got {name!r} of the term {term.name!r}; "
                     "choose another one."

@@ -61,7 +61,11 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
 def restart_count(world_model: nn.Module) -> None:
     """Takes a version that was loaded, not counted, as the one to go on from."""
     if world_model in _counts:
-        _counts[world_model].after = _version(world_model).clone()
+        count, version = _counts[world_model], _version(world_model)
+        if count.after.device == version.device:
+            count.after.copy_(version)  # in place: a captured CUDA graph goes on reading this memory
+        else:
+            count.after = version.clone()
 
 
 def _version(world_model: nn.Module) -> Tensor:

@@ -406,7 +406,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 "environment a plan_mean_key of their own, and each its primer."
             )
         if is_init is not None:
-            starts = is_init.reshape(*carried.shape[:-2], 1, 1)  # [..., 1], or [...] as some environments write it
+            starts = is_init.bool().reshape(*carried.shape[:-2], 1, 1)  # [..., 1], or [...] as some environments do
             carried = torch.where(starts, torch.zeros_like(carried), carried)
         return carried, True
 

@@ -41,9 +41,14 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
-)
+class _Dumper(yaml.SafeDumper):
+    """Puts in quotes what the loader would take for a number."""
+
+
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+    )
 
 
 @dataclass(frozen=True)
@@ -448,7 +453,8 @@ def write_experiment(experiment: Experiment, file: Path) -> None:
     >>> read_experiment(file).seeds
     (1, 2)
     """
-    write_whole(file, yaml.safe_dump(experiment.to_dict(), sort_keys=False, allow_unicode=True))
+    text = yaml.dump(experiment.to_dict(), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    write_whole(file, text)
 
 
 def _variants(given: Any, more: Mapping[str, Any], file: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Search]]:

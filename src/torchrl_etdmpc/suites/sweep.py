@@ -120,6 +120,7 @@ class Sweep:
                 continue
             last = [read_progress(run) for run in runs]
             if all(entry.state == "finished" for entry in last):
+                self._report(number, runs)  # later trials are compared with it at each step
                 self._tell(number, fmean(entry.latest_return for entry in last))
             elif self.search.prune and self._should_be_pruned(number, runs):
                 self._tell(number, None)
@@ -181,7 +182,12 @@ class Sweep:
         self._open.pop(number, None)
 
     def _should_be_pruned(self, number: int, runs: list[Run]) -> bool:
-        """Reports the evaluations that all runs have reached, but for the last one; asks the pruner if one is new."""
+        """Reports the evaluations; asks the pruner if one is new."""
+        trial = self._report(number, runs)
+        return trial is not None and trial.should_prune()
+
+    def _report(self, number: int, runs: list[Run]) -> optuna.trial.Trial | None:
+        """The trial, if there are new evaluations that all its runs have reached, but for the last one of a run."""
         import optuna
 
         frozen = self._study.get_trials(deepcopy=False)[number]
@@ -190,7 +196,7 @@ class Sweep:
         reached = set(curves[0]).intersection(*curves[1:]) - set(frozen.intermediate_values)
         for step in sorted(reached):
             trial.report(fmean(curve[step] for curve in curves), step)
-        return bool(reached) and trial.should_prune()
+        return trial if reached else None
 
 
 def _study(file: Path, name: str, search: Search) -> optuna.Study:
@@ -205,7 +211,7 @@ def _study(file: Path, name: str, search: Search) -> optuna.Study:
             storage=URL.create("sqlite", database=str(file)).render_as_string(),
             study_name=name,
             direction="maximize",
-            pruner=optuna.pruners.MedianPruner() if search.prune else optuna.pruners.NopPruner(),
+            pruner=optuna.pruners.MedianPruner(n_min_trials=5) if search.prune else optuna.pruners.NopPruner(),
             load_if_exists=True,
         )
     except Exception as error:  # SQLAlchemy has dozens

@@ -116,12 +116,12 @@ class AnalyticWorld(nn.Module):
         """Steps every head: ``[F, ..., L]`` (or ``[1, ..., L]``) and an action to ``[F, ..., L]``."""
         shape = torch.broadcast_shapes(latent.shape[:-1], action.shape[:-1])
         latent, action = latent.expand(*shape, self.latent_dim), action.expand(*shape, self.action_dim)
-        drift = nn.functional.pad(self.drift, (0, self.latent_dim - self.observation_dim))
+        drift = nn.functional.pad(self.drift, (0, self.latent_dim - self.observation_dim)).to(latent.dtype)
         return self.transition(latent, action) + drift.view(-1, *(1,) * (latent.ndim - 2), self.latent_dim)
 
     def values(self, latent: Tensor) -> Tensor:
         """Value of ``latent [..., L]`` by each value head, shape ``[..., V]``."""
-        return self.value(latent).unsqueeze(-1) + self.value_offset
+        return self.value(latent).unsqueeze(-1) + self.value_offset.to(latent.dtype)
 
     def termination(self, latent: Tensor) -> Tensor | None:
         """Probability that the episode terminated on reaching ``latent [..., L]``; ``None``: it never does."""
@@ -282,7 +282,8 @@ class LQRWorld(AnalyticWorld):
 
     def transition(self, latent: Tensor, action: Tensor) -> Tensor:
         """``A x + B a``."""
-        return latent @ self.transition_matrix.mT + action @ self.control_matrix.mT
+        a, b = self.transition_matrix.to(latent.dtype), self.control_matrix.to(latent.dtype)
+        return latent @ a.mT + action @ b.mT
 
     def reward(self, latent: Tensor, action: Tensor) -> Tensor:
         """``-(x'Qx + a'Ra)``."""
@@ -302,7 +303,7 @@ def _matrix(given: Tensor | None, default: Tensor | list) -> Tensor:
 
 
 def _quadratic(x: Tensor, matrix: Tensor) -> Tensor:
-    return ((x @ matrix) * x).sum(-1)
+    return ((x @ matrix.to(x.dtype)) * x).sum(-1)
 
 
 def _solve_riccati(

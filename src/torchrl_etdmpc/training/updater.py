@@ -107,8 +107,7 @@ class Updater:
         self._clipped = {name: [p for p in parts if p in self.parts] for name, parts in _CLIPPED_TOGETHER.items()}
         followed = loss.target_parameters()
         if any(followed.values()):
-            # Tells the loss that its targets follow, and nothing else: it warns of a rate above one half.
-            SoftUpdate(loss, tau=min(tau, 0.5))
+            _tell_that_targets_follow(loss)
         values = {id(value): target for target, value in followed.pop("value", [])}
         self._flat_targets: Tensor | None = None
         if values:
@@ -288,19 +287,32 @@ class Updater:
         """Restores :meth:`state_dict`.
 
         Raises:
-            ValueError: if it is of an updater without a schedule or averages that this one has.
+            ValueError: if it is of an updater without a schedule or averages that this one has, or with a schedule that
+                it lacks.
         """
         needed = {"schedule": ("lr_halved_after", self._schedule), "averaged": ("average_decay", self.average_decay)}
         for entry, (argument, own) in needed.items():
             if own and entry not in state_dict:
                 raise ValueError(f"the state is of an updater without {argument}; build this one without it, too.")
+        if "schedule" in state_dict and self._schedule is None:  # the rates would stay where they have fallen to
+            raise ValueError("the state is of an updater with lr_halved_after; build this one with it, too.")
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
         if self._schedule is not None:
             self._schedule.last_epoch = state_dict["schedule"]["updates"]
+            self._schedule.base_lrs = [group["initial_lr"] for group in self.optimizer.param_groups]
         if self.average_decay:
             self.acting_model.load_state_dict(state_dict["averaged"])
+
+
+def _tell_that_targets_follow(loss: LatentRolloutLoss) -> None:
+    """Registers an updater, without which TorchRL warns; its first act, weights copied into the targets, is undone."""
+    targets: list[Any] = [part for name, part in loss.named_children() if name.startswith("target_")]
+    before = [(entry.data, entry.data.clone()) for part in targets for entry in part.values(True, True)]
+    SoftUpdate(loss, tau=0.5)  # of which nothing else is used
+    for entry, value in before:
+        entry.copy_(value)
 
 
 def _parts(loss: LatentRolloutLoss) -> dict[str, list[nn.Parameter]]:
