@@ -64,9 +64,7 @@ def read_progress(run: Run) -> Progress:
         summary = _summary(directory.summary)
         steps = whole_of(summary, "env_steps") or steps
         if steps >= run.config.total_env_steps:
-            if (
-                "final_return" in summary
-            ):  # null: the last evaluation failed, and an earlier one is not it
+            if "final_return" in summary:  # null: the last evaluation failed, and an earlier one is not it
                 latest = number_of(summary, "final_return")
             return Progress("finished", steps, latest, number_of(summary, "decisions_per_second", speed))
     if directory.in_use:
