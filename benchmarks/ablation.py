@@ -7,9 +7,9 @@
 
 Runs stand in `runs/<experiment>`, where `examples/suite.py` goes on with interrupted ones. Of finished ones
 `benchmarks/results/cpu/<ablation or adaptive>/<variant>/<task>/seed<k>` gets `eval.csv` and `summary.json`. They are
-compared with the experiment's runs of the preset as it is, or where it has none with those of `cpu_learning.py`: same
-settings but for the variant's own, same seed and so the same random phase, ten episodes an evaluation. Writes
-`README.md` and `differences.png` there.
+compared with the preset as it is, by the experiment's own runs of it or those of `cpu_learning.py`, whose evaluations
+have ten episodes; where there is neither it is trained, too. Same settings but for the variant's own, same seed and so
+the same random phase. Writes `README.md` and `differences.png` there.
 """
 
 from __future__ import annotations
@@ -45,34 +45,42 @@ def file_of(name: str) -> Path:
 
 
 def collect(runs: Path, folder: Path) -> None:
-    """Copies what is kept of finished runs, but for those that ``cpu_learning.py`` keeps."""
+    """Copies what is kept of finished runs, but for those of the preset that ``cpu_learning.py`` keeps."""
     for summary in sorted(runs.glob("*/*/seed*/summary.json")):
         source = RunDirectory(summary.parent)
         variant, task, seed = summary.parts[-4:-1]
-        if variant != "cpu":
+        if variant != "cpu" or not (RESULTS / task / seed).exists():
             target = folder / variant / task / seed
             target.mkdir(parents=True, exist_ok=True)
             for file in (source.eval, source.summary):
                 shutil.copy(file, target)
 
 
-def read_pairs(folder: Path, base: str) -> pd.DataFrame:
-    """Runs of variants that the base has with the same task and seed.
+def partner(folder: Path, base: str, task: str, seed: str) -> Path | None:
+    """The run of the preset as it is with the same task and seed, if there is one."""
+    found = (path for path in (folder / base / task / seed, RESULTS / task / seed) if RunDirectory(path).finished)
+    return next(found, None)
+
+
+def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
+    """Runs of variants that the base has with the same task and seed; the names of those that it has not.
 
     Args:
         folder: of the kept runs.
         base: the variant that is the preset as it is; its runs are in ``folder`` or else below ``RESULTS``.
 
     Returns:
-        DataFrame: index ``variant, task, seed``; the returns of both at ``STEPS`` (columns ``variant 50000`` and
-        ``base 50000`` for the last one).
+        tuple: index ``variant, task, seed``; the returns of both at ``STEPS`` (columns ``variant 50000`` and
+        ``base 50000`` for the last one). And ``variant/task/seed`` of each run without a partner.
     """
-    rows = []
+    rows, alone = [], []
     for path in sorted(folder.glob("*/*/seed*")):
         variant, task, seed = path.parts[-3:]
-        own = folder / base / task / seed
-        beside = own if own.exists() else RESULTS / task / seed
-        if variant == base or not RunDirectory(beside).finished:
+        beside = partner(folder, base, task, seed)
+        if variant == base:
+            continue
+        if beside is None:
+            alone.append(f"{variant}/{task}/{seed}")
             continue
         row: dict[str, object] = {"variant": variant, "task": task, "seed": int(seed.removeprefix("seed"))}
         for name, run in (("variant", path), ("base", beside)):
@@ -81,7 +89,7 @@ def read_pairs(folder: Path, base: str) -> pd.DataFrame:
         rows.append(row)
     if not rows:
         sys.exit(f"error: no runs under {folder} that the preset has too; run this script without --report-only first.")
-    return pd.DataFrame(rows).set_index(["variant", "task", "seed"])
+    return pd.DataFrame(rows).set_index(["variant", "task", "seed"]), alone
 
 
 def mean_over_tasks(differences: pd.Series) -> tuple[float, float]:
@@ -103,8 +111,8 @@ def groups(tasks: pd.Index, chosen: Sequence[str]) -> dict[str, pd.Index]:
     return {name: part for name, part in parts.items() if name == "all" or 0 < len(part) < len(tasks)}
 
 
-def report(pairs: pd.DataFrame, experiment: Experiment) -> str:
-    """Tables of every variant."""
+def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = ()) -> str:
+    """Tables of every variant, and what is in none of them."""
     lines = [f"# {experiment.title}", "", *__doc__.strip().split("\n\n")[-1].splitlines(), ""]
     lines += [
         f"A difference is the variant's return minus that of *{experiment.base}*, of runs with the same task and seed;",
@@ -112,6 +120,7 @@ def report(pairs: pd.DataFrame, experiment: Experiment) -> str:
         "difference per task): it says what other tasks of this kind would show, not what other seeds would.",
         f"{', '.join(TASKS[:-1])} and {TASKS[-1]} are those that the preset was tuned on.",
         "",
+        *([f"Left out, because *{experiment.base}* has no run beside them: {', '.join(alone)}.", ""] if alone else []),
     ]
     for variant in in_order(pairs, experiment):
         rows = pairs.xs(variant, level="variant")
@@ -205,12 +214,17 @@ def main() -> None:
     arguments = parser.parse_args()
     experiment, folder = read_experiment(file_of(arguments.experiment)), RESULTS / KEPT[arguments.experiment]
     if not arguments.report_only:
+        file, runs = file_of(arguments.experiment), arguments.runs or ROOT / "runs" / arguments.experiment
         variants = arguments.variants or [name for name in experiment.variants if name != experiment.base]
-        runs = arguments.runs or ROOT / "runs" / arguments.experiment
-        train(file_of(arguments.experiment), variants, arguments.tasks or experiment.tasks, arguments.seeds, runs)
+        tasks = arguments.tasks or experiment.tasks
+        for seed in arguments.seeds:
+            without = [task for task in tasks if partner(folder, experiment.base, task, f"seed{seed}") is None]
+            if without:
+                train(file, [experiment.base], without, [seed], runs)
+        train(file, variants, tasks, arguments.seeds, runs)
         collect(runs, folder)
-    pairs = read_pairs(folder, experiment.base)
-    (folder / "README.md").write_text(report(pairs, experiment))
+    pairs, alone = read_pairs(folder, experiment.base)
+    (folder / "README.md").write_text(report(pairs, experiment, alone))
     draw(pairs, experiment).savefig(folder / "differences.png", dpi=120)
 
 

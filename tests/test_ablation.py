@@ -47,17 +47,39 @@ def test_runs_are_paired_by_task_and_seed_and_tasks_count_alike(script, tmp_path
     assert "| all | 3 | +8 [-18, +34] | +16 [-37, +69] | +24 [-55, +103] | +32 [-73, +137] | +40 [-91, +171] |" in page
     assert "| tuned on | 1 | +20 | +40 | +60 | +80 | +100 |" in page
     assert "| walker-run | 1, 2 | 200 | 220 | +20 |" in page
-    assert "cheetah-run" not in page
+    assert page.count("cheetah-run") == 1
+    assert "Left out, because *cpu* has no run beside them: one head/cheetah-run/seed1." in page
     assert (tmp_path / "ablation" / "differences.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_kept_of_the_experiment_s_runs_leaves_the_base_out(script, tmp_path):
+def test_what_is_kept_of_the_experiment_s_runs_leaves_out_what_is_kept_elsewhere(script, tmp_path):
+    write(tmp_path / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
     for variant in ("cpu", "no reanalyze"):
         write(tmp_path / "runs" / variant / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
     kept = tmp_path / "ablation"
     script.collect(tmp_path / "runs", kept)
     found = sorted(str(file.relative_to(kept)) for file in kept.rglob("*") if file.is_file())
     assert found == [f"no reanalyze/walker-run/seed1/{name}" for name in ("eval.csv", "summary.json")]
+
+
+def test_the_base_is_trained_and_kept_where_it_has_no_run(script, tmp_path, monkeypatch):
+    write(tmp_path / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
+    trained = []
+
+    def train(file, variants, tasks, seeds, runs):
+        trained.append((variants, tasks, seeds))
+        for variant in variants:
+            for seed in seeds:
+                write(runs / variant / tasks[0] / f"seed{seed}", dict.fromkeys(script.STEPS, 2.0))
+
+    monkeypatch.setattr(script, "train", train)
+    command = ["ablation.py", "--variants", "one head", "--tasks", "walker-run", "--seeds", "1", "4", "--runs"]
+    monkeypatch.setattr(sys, "argv", [*command, str(tmp_path / "runs")])
+    script.main()
+    assert trained == [(["cpu"], ["walker-run"], [4]), (["one head"], ["walker-run"], [1, 4])]
+    assert (tmp_path / "ablation" / "cpu" / "walker-run" / "seed4" / "eval.csv").exists()
+    page = (tmp_path / "ablation" / "README.md").read_text()
+    assert "| walker-run | 1, 4 | 2 | 2 | +0 |" in page  # 1.5 and 2
 
 
 def test_without_a_pair_there_is_one_line(script, monkeypatch):
