@@ -109,6 +109,16 @@ def test_a_flag_may_stand_between_settings(run_command, tmp_path, monkeypatch):
     assert run_command("preset=cpu", "--multirun", "seed=3,4", "run_dir=runs/${seed}").run_dir == "runs/3"
 
 
+@pytest.mark.parametrize("values", ["20,30", "range(20,40,10)", "choice(20,30)"])
+def test_settings_of_the_task_are_swept_and_name_directories_as_they_are_typed(
+    run_command, tmp_path, monkeypatch, values
+):
+    monkeypatch.chdir(tmp_path)
+    task = ("task=gym/Pendulum-v1", "preset=cpu", f"task.episode_length={values}")
+    config = run_command("--multirun", *task, "run_dir=runs/${task.episode_length}")
+    assert (config.episode_length, config.run_dir) == (20, "runs/20")
+
+
 def test_a_sweep_leaves_no_folder_but_those_of_its_runs(run_command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sweep = ("preset=cpu", "--multirun", "planner.horizon=3,4", "run_dir=runs/${planner.horizon}")

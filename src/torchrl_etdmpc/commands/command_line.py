@@ -202,6 +202,8 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
                 preset(preset_name)
         if name in _PATHS and value.startswith("~"):
             value = os.path.expanduser(value)
+        if name == "run_dir":  # a setting of the task is named as it is typed; for Hydra the task is a text
+            value = re.sub(r"\$\{task\.(\w+)\}", r"${\1}", value)
         short = name.removeprefix("task.")
         checked.append(f"{short}={value if sweep else _readable(settings[name], value)}")
     given = {argument.partition("=")[0] for argument in checked}
@@ -302,6 +304,8 @@ def _import_own_code(arguments: list[str]) -> None:
             if name in given and given[name] != "null":
                 settings[name] = _TRUTH[given[name].lower()] if name == "terminates" else int(float(given[name]))
         except (KeyError, ValueError) as error:
+            if _SWEEP_FLAGS & set(sys.argv):  # several values, which are checked run by run
+                continue
             kind = "true or false" if name == "terminates" else "a whole number"
             raise ValueError(f"task.{name} must be {kind}, got {given[name]!r}.") from error
     for task in given.get("task", "").split(","):  # a sweep names several
