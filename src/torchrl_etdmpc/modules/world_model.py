@@ -193,10 +193,8 @@ class WorldModel(nn.Module):
 
     def _place_bins(self) -> None:
         """Puts them where they belong, as exactly as their dtype can say."""
-        exact = torch.linspace(*self._bin_ends, len(self.bins), dtype=torch.float64, device="cpu")
-        if self.bins.dtype != torch.float64:
-            exact = torch.linspace(*self._bin_ends, len(self.bins), dtype=torch.float32, device="cpu")
-        self.bins.copy_(exact)
+        dtype = torch.promote_types(self.bins.dtype, torch.float32)
+        self.bins.copy_(torch.linspace(*self._bin_ends, len(self.bins), dtype=dtype, device="cpu"))
 
     def _apply(self, fn, recurse: bool = True):
         super()._apply(fn, recurse)
