@@ -202,7 +202,7 @@ class WorldModel(nn.Module):
             self._place_bins()
         return self
 
-    def _load_from_state_dict(self, state_dict, prefix, *args):
+    def _load_from_state_dict(self, state_dict, prefix, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
         super()._load_from_state_dict(state_dict, prefix, *args)
         if f"{prefix}bins" not in state_dict or self.bins.is_meta:
             return
