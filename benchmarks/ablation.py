@@ -213,15 +213,18 @@ def main() -> None:
     parser.add_argument("--report-only", action="store_true")
     arguments = parser.parse_args()
     experiment, folder = read_experiment(file_of(arguments.experiment)), RESULTS / KEPT[arguments.experiment]
+    others = [name for name in experiment.variants if name != experiment.base]
+    unknown = [name for name in arguments.variants or [] if name not in others]
+    if unknown:
+        parser.error(f"--variants of {arguments.experiment} are {', '.join(map(repr, others))}; got {unknown[0]!r}.")
     if not arguments.report_only:
         file, runs = file_of(arguments.experiment), arguments.runs or ROOT / "runs" / arguments.experiment
-        variants = arguments.variants or [name for name in experiment.variants if name != experiment.base]
         tasks = arguments.tasks or experiment.tasks
         for seed in arguments.seeds:
             without = [task for task in tasks if partner(folder, experiment.base, task, f"seed{seed}") is None]
             if without:
                 train(file, [experiment.base], without, [seed], runs)
-        train(file, variants, tasks, arguments.seeds, runs)
+        train(file, arguments.variants or others, tasks, arguments.seeds, runs)
         collect(runs, folder)
     pairs, alone = read_pairs(folder, experiment.base)
     (folder / "README.md").write_text(report(pairs, experiment, alone))

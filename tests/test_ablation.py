@@ -103,3 +103,13 @@ def test_a_base_of_the_experiment_s_own_goes_before_the_preset_s_run(script, tmp
     table = page[page.index("## Returns") :]
     assert "| walker-run | mean | 1, 2 | 300 | 300 | 300 | 300 | 300 |" in table
     assert table.index("|  | final | 1, 2 | 500 |") < table.index("|  | adaptive beta 0 | 2 | 260 |")
+
+
+@pytest.mark.parametrize("variant", ["one hed", "mean"])
+def test_a_variant_that_there_is_not_is_refused_before_anything_is_trained(script, monkeypatch, capsys, variant):
+    monkeypatch.setattr(script, "train", lambda *arguments: pytest.fail("trains"))
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--experiment", "adaptive", "--variants", variant])
+    with pytest.raises(SystemExit):
+        script.main()
+    assert "--variants of adaptive are 'final', 'adaptive beta 0'" in (said := capsys.readouterr().err)
+    assert f"got {variant!r}." in said

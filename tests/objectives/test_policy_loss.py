@@ -320,3 +320,12 @@ def test_what_stands_in_the_place_of_a_missing_plan_does_not_matter(make_loss, m
     for expected, gradient in zip(*found, strict=True):
         assert (gradient is None) == (expected is None)
         assert gradient is None or torch.equal(gradient, expected)
+
+
+def test_a_policy_loss_that_distils_nothing_is_empty_for_several_processes_too(
+    make_loss, make_world_model, make_slices, monkeypatch
+):
+    loss = make_loss("policy", make_world_model())
+    loss.distill = False
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    assert list(loss(make_slices()).keys()) == []

@@ -118,3 +118,14 @@ def test_a_missing_observation_is_named(make_planner, states):
         KeyError, match=r"the planner needs 'pixels' \(or 'latent'\) in its input; pass observation_key="
     ):
         planner(TensorDict({"observation": states(2)}, batch_size=[2]))
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float32, torch.uint8])
+def test_starts_of_episodes_are_read_from_any_kind_of_flag(make_planner, states, dtype):
+    planner, found = make_planner(warm_start=True), []
+    flags = torch.tensor([[True], [False], [True]])
+    entries = {"observation": states(3), "plan_mean": torch.rand(3, 3, 2, dtype=torch.float64)}
+    for kind in (torch.bool, dtype):
+        torch.manual_seed(0)
+        found.append(planner(TensorDict({**entries, "is_init": flags.to(kind)}, batch_size=[3]))["action"])
+    assert torch.equal(*found)
