@@ -25,7 +25,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 import torch  # noqa: E402
 
-from torchrl_etdmpc.envs import DMC_TASKS, HUMANOIDBENCH_HARD, get_task, make_env  # noqa: E402
+from torchrl_etdmpc.envs import DMC_TASKS, HUMANOIDBENCH_HARD, env_sizes, get_task, make_env  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     build_agent,
     build_collector,
@@ -74,8 +74,7 @@ def exercise(task: str, preset_name: str, device: torch.device) -> dict[str, obj
     config = dataclasses.replace(base, task=task, compile="off", total_env_steps=5000, replay=replay_config)
     torch.manual_seed(0)
     env = make_env(task, seed=0)
-    sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-    agent = build_agent(config, *sizes, device)
+    agent = build_agent(config, **env_sizes(env), device=device)
     replay = build_replay(config, device)
     reanalyze = build_reanalyze(config, agent, replay)
     collector = build_collector(config, agent, env, replay)
@@ -102,8 +101,8 @@ def exercise(task: str, preset_name: str, device: torch.device) -> dict[str, obj
         raise RuntimeError(f"reanalyze refreshed {reanalyze.refreshed} targets and found {reanalyze.stale} stale")
     return {
         "task": task,
-        "observation": sizes[0],
-        "action": sizes[1],
+        "observation": agent.world_model.observation_dim,
+        "action": agent.world_model.action_dim,
         "iterations": agent.planner.iterations,
         "parameters": sum(parameter.numel() for parameter in agent.world_model.parameters()),
         "plan_s": round(plan_s, 3),

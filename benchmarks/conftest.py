@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 import re
 import statistics
 import sys
@@ -16,7 +15,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from torchrl_etdmpc.runs import library_versions
+from torchrl_etdmpc.runs import library_versions, processor
 
 CUDA = torch.cuda.is_available()
 RESULTS = Path(__file__).parent / "results" / ("gpu" if CUDA else "cpu")
@@ -33,13 +32,6 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(autouse=True)
 def _one_thread() -> None:
     torch.set_num_threads(1)  # every time: closing a batched environment of TorchRL changes it
-
-
-def processor() -> str:
-    """The CPU's name where the system tells it."""
-    file = Path("/proc/cpuinfo")
-    names = re.findall(r"^model name\s*: (.+)$", file.read_text(), re.M) if file.exists() else []
-    return f"{platform.machine()} ({names[0]})" if names else platform.machine()
 
 
 class Measure:

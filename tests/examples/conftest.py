@@ -170,3 +170,14 @@ def run_script(start: Callable[..., Script]) -> Callable[..., subprocess.Complet
         return subprocess.CompletedProcess([str(script), *arguments], process.returncode, out, err)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def run_process() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs Python with these arguments as a shell would, with all imports of its own."""
+
+    def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+        command, options = [sys.executable, *arguments], {"capture_output": True, "text": True, "timeout": 600}
+        return subprocess.run(command, cwd=cwd, env=shell_environment(), check=False, **options)
+
+    return run

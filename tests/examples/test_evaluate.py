@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -36,14 +34,6 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory, save_untrained) -> Path
 @pytest.fixture
 def run_main(run_here) -> Callable[..., tuple[str | None, str, str]]:
     return partial(run_here, "evaluate.py")
-
-
-def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
-    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [sys.executable, *command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
 
 
 def closing_line(returns: torch.Tensor, policy: str) -> str:
@@ -306,7 +296,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-def test_a_film_shows_every_decision_of_the_first_episode(tmp_path, checkpoint):
+def test_a_film_shows_every_decision_of_the_first_episode(tmp_path, checkpoint, run_process):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     arguments = f"checkpoint={checkpoint} video=films/cartpole.mp4 episodes=2 policy=bare device=cpu".split()
     arguments.append("task.episode_length=200")

@@ -4,10 +4,8 @@ import csv
 import hashlib
 import importlib.util
 import json
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -30,14 +28,6 @@ SMALL_RUN = (
 ).split()
 
 PARTS = ("agent", "best", "collector", "sampler", "reanalyze", "learner", "log", "state", "random")
-
-
-def run_process(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO_GL", "HYDRA"))}
-    environment |= {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [sys.executable, *command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
 
 
 def file_hashes(directory: Path) -> dict[str, str]:
@@ -151,7 +141,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
         ("hydra", "this command needs hydra-core; run: pip install 'hydra-core>=1.3,<1.4'"),
     ],
 )
-def test_a_missing_package_is_named_in_one_line(tmp_path, package, message):
+def test_a_missing_package_is_named_in_one_line(tmp_path, package, message, run_process):
     process = run_process("-c", WITHOUT, package, str(SCRIPT), *SMALL_RUN, cwd=tmp_path)
     assert process.returncode == 1
     assert process.stdout == ""

@@ -9,13 +9,6 @@ from torchrl_etdmpc.modules import MLP, EnsembleLinear, NormedLinear
 from torchrl_etdmpc.modules.normed_linear import INIT_STD
 
 
-@pytest.fixture(autouse=True)
-def seeded():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        yield
-
-
 def identity(x: torch.Tensor) -> torch.Tensor:
     return x
 

@@ -300,8 +300,8 @@ def _disturb(tensors) -> None:
 def _plain_errors(
     loss: LossModule,
     slices: TensorDict,
-    noise: Tensor,
     *,
+    seed: int = 7,
     discount: float = 0.9,
     value_beta: float = 0.0,
     value_replayed: float = 0.0,
@@ -313,13 +313,15 @@ def _plain_errors(
     Args:
         loss (LossModule): the weights; the targets are the value heads' own where the loss has none.
         slices (TensorDict): ``[B, T]``.
-        noise (Tensor): the policy's noise in the value targets, ``[T, B, A]``.
+        seed (int): of the policy's noise in the value targets, which a loss draws likewise.
         discount (float): of the value targets.
         value_beta (float): as in the loss.
         value_replayed (float): as in the loss.
         value_expectile (float): as in the loss.
         kl_direction (str): as in the loss.
     """
+    torch.manual_seed(seed)
+    noise = torch.randn_like(slices["action"].transpose(0, 1))
     world_model = loss.world_model
     group = world_model.encoder.output.activation.keywords["group_size"]
     bins = world_model.bins

@@ -20,17 +20,11 @@ def _time_first(slices) -> Slices:
     )
 
 
-def _noise(slices, seed: int = 7):
-    """The policy noise that a loss draws after this seed."""
-    torch.manual_seed(seed)
-    return torch.randn_like(slices["action"].transpose(0, 1))
-
-
 def test_the_terms_equal_a_plain_reference_written_head_by_head_and_step_by_step(
     make_world_model, make_loss, slices, plain_errors, depth_mean
 ):
     loss = make_loss("model", make_world_model(termination=True))
-    errors = plain_errors(loss, slices, _noise(slices))
+    errors = plain_errors(loss, slices)
     out = loss(slices)
     torch.testing.assert_close(out["loss_consistency"], 20 * depth_mean(errors["consistency"]))
     torch.testing.assert_close(out["loss_reward"], 0.1 * depth_mean(errors["reward"]))
@@ -56,7 +50,7 @@ def test_the_gradient_of_each_term_is_that_of_the_plain_reference(
 ):
     world_model = make_world_model(termination=True)
     loss = make_loss("model", world_model)
-    expected = gradients(coefficient * depth_mean(plain_errors(loss, slices, _noise(slices))[term], rho), world_model)
+    expected = gradients(coefficient * depth_mean(plain_errors(loss, slices)[term], rho), world_model)
     actual = gradients(loss(slices)[f"loss_{term}"], world_model)
     assert_same_gradients(actual, expected)
 

@@ -49,14 +49,6 @@ def test_training_and_evaluation_choose_their_own_first_action(training, evaluat
         torch.testing.assert_close(planner.plan(observation, noise=noise, explore=explore).loc, expected.loc)
 
 
-def elites_by_hand(planner, actions, scores) -> tuple[list[int], list[float]]:
-    """Indices and weights of the best of N candidates by plain loops; the scores are finite."""
-    scores = scores.tolist()
-    best = sorted(range(len(scores)), key=lambda n: -scores[n])[: planner.num_elites]
-    weights = [math.exp(planner.inverse_temperature * (scores[n] - scores[best[0]])) for n in best]
-    return best, [weight / sum(weights) for weight in weights]
-
-
 def test_the_best_first_action_is_that_of_the_highest_scoring_candidate(make_planner, states):
     plan = make_planner(first_action="best").plan(states(6), trace=True)
     for i in range(6):

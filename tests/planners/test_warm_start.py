@@ -4,23 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_etdmpc import Plan
-
 _WARNING = (
     "^'plan_mean' is not in the planner's input, so every plan starts cold; append planner.make_tensordict_primer"
 )
-
-
-def run(planner, tensordict, *, seed: int = 0):
-    """The planner's output on a copy of the input, with seeded noise."""
-    torch.manual_seed(seed)
-    return planner(tensordict.clone())
-
-
-def expected_plan(planner, observation, carried, *, seed: int = 0) -> Plan:
-    """The same from ``plan``."""
-    torch.manual_seed(seed)
-    return planner.plan(observation, carried, explore=False, noise=planner.draw_noise(len(observation)))
 
 
 def test_the_first_candidates_are_drawn_around_the_shifted_previous_plan(make_planner, states):

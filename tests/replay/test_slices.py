@@ -773,20 +773,6 @@ def test_what_will_never_make_a_slice_says_so():
         full.sample()
 
 
-def test_the_state_of_version_0_2_is_read():
-    old = {
-        "written": 6,
-        "followed": 6,
-        "segments": torch.tensor([[0, 1, 5], [2, 2, 1], [3, 2, 1], [4, 5, 6]]),  # start, spacing, rows, id
-        "open": {4: 0, 5: 1, 6: 2},
-    }
-    ring = Ring(20, 2)
-    ring.write([(4, 0), (5, 0), (4, 1), (5, 1), (4, 2), (6, 0)])
-    ring.sampler.load_state_dict(old)
-    ring.write([(6, 1), (4, 3), (5, 2)])
-    assert ring.every_drawn_slice() == ring.every_valid_slice()
-
-
 def test_the_state_is_small_where_rows_come_in_turn():
     ring = Ring(2000, 3)
     ring.write(interleaved([50], 4, 2000))

@@ -155,7 +155,7 @@ def test_the_value_of_the_regulator_is_the_return_of_its_own_control():
 
 
 def test_a_regulator_that_cannot_hold_its_state_is_refused():
-    with pytest.raises(ValueError, match=r"^the Riccati equation has no solution after 10000 iterations"):
+    with pytest.raises(ValueError, match=r"^the Riccati equation has no solution after 10,000 iterations"):
         LQRWorld(torch.full((1, 1), 1.2), torch.zeros(1, 1), discount=1.0)
 
 

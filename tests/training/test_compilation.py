@@ -158,7 +158,7 @@ def test_compiled_updates_leave_no_memory_behind(warmed):
     updater, batch = warmed[0].learner.agent.updater, random_slices(5, 1, num_slices=4).contiguous()
 
     counts = []
-    for _ in range(6):
+    for _ in range(4):
         for _ in range(100):
             updater.step(batch)
         gc.collect()

@@ -226,7 +226,7 @@ def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
     return table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
 
 
-def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = None) -> pd.DataFrame:
+def read_runs(paths: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
     """The seed curves of all runs in or below the paths.
 
     Raises:
@@ -244,7 +244,7 @@ def read_runs(paths: Iterable[str | os.PathLike[str]], *, method: str | None = N
     >>> read_runs([folder])["seed"].tolist()
     [1, 2]
     """
-    return join_runs([Run.read(run_dir, method=method) for run_dir in find_runs(paths)])
+    return join_runs([Run.read(run_dir) for run_dir in find_runs(paths)])
 
 
 def join_runs(runs: Iterable[Run]) -> pd.DataFrame:

@@ -210,7 +210,7 @@ def plot_aggregate(
     for method in named:
         curve, style = trained[trained["method"] == method], styles[method]
         if len(curve) > 1:
-            _line(axis, curve.assign(task="aggregate"), style, budget)
+            _line(axis, curve, style, budget)
         else:
             half = Z_95 * curve["standard_error"].fillna(0)
             look = {"color": style["color"], "marker": style["marker"], "markersize": 4, "elinewidth": 1}

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from torchrl_etdmpc.analysis.statistics import interpolate, seed_estimates
-from torchrl_etdmpc.analysis.tables import AGGREGATE
+from torchrl_etdmpc.analysis.tables import AGGREGATE, escape
 
 ALL_TASKS = "All tasks"
 RESAMPLES = 2000
@@ -127,7 +127,7 @@ def paired_markdown(table: pd.DataFrame) -> str:
         digits = 3 if row.task.startswith(AGGREGATE) else 1
         difference = _quote(f"+.{digits}f", row.difference, row.lower, row.upper)
         improvement = _quote(".2f", row.improvement, row.improvement_lower, row.improvement_upper)
-        names = " | ".join(str(name).replace("|", "\\|") for name in (row.variant, row.base, row.task))
+        names = " | ".join(escape(name) for name in (row.variant, row.base, row.task))
         lines.append(f"| {names} | {difference} | {improvement} | {row.pairs} | {row.left_out} |")
     return "\n".join(lines) + "\n"
 

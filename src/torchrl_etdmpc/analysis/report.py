@@ -17,7 +17,7 @@ from PIL import Image
 
 from torchrl_etdmpc.analysis.comparison import Comparison
 from torchrl_etdmpc.analysis.figures import plot_aggregate, plot_auc, plot_curves
-from torchrl_etdmpc.analysis.paired import paired_markdown
+from torchrl_etdmpc.analysis.paired import RESAMPLES, paired_markdown
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
 from torchrl_etdmpc.analysis.statistics import (
     NORMALISER,
@@ -26,8 +26,8 @@ from torchrl_etdmpc.analysis.statistics import (
     interpolate,
     normalise,
 )
-from torchrl_etdmpc.analysis.steps import MEAN, escape, overview, step_table
-from torchrl_etdmpc.analysis.tables import AGGREGATE, result_table, to_csv, to_markdown
+from torchrl_etdmpc.analysis.steps import MEAN, overview, step_table
+from torchrl_etdmpc.analysis.tables import AGGREGATE, escape, result_table, to_csv, to_markdown
 from torchrl_etdmpc.runs.files import replacing
 
 FIGURES = ("curves", "aggregate", "auc")
@@ -262,8 +262,8 @@ def _paired(comparison: Comparison) -> str:
     text = (
         "Difference of returns, and probability that a run of the variant scores more than one of the base (ties "
         f"half), of the runs that both have with the same task and seed. {over}In brackets: 95% percentile interval of "
-        "a bootstrap that resamples pairs within each task (2,000 resamples; narrower than it should be where pairs "
-        "are few, none with one pair on a task). Left out: runs of either without a partner.\n"
+        f"a bootstrap that resamples pairs within each task ({RESAMPLES:,} resamples; narrower than it should be where "
+        "pairs are few, none with one pair on a task). Left out: runs of either without a partner.\n"
     )
     return "\n".join([f"## Variants against {against}\n", text, paired_markdown(table)])
 

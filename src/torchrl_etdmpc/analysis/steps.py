@@ -9,12 +9,12 @@ import pandas as pd
 
 from torchrl_etdmpc.analysis.curves import POINT_COLUMNS
 from torchrl_etdmpc.analysis.statistics import add_interval, interpolate
+from torchrl_etdmpc.analysis.tables import DASH, escape
 
 STEPS = (20_000, 50_000, 100_000, 200_000)
 """Env steps at which reports table returns."""
 MEAN = "Mean over tasks"
 """The name of the row over all tasks in tables of returns."""
-DASH = "–"
 _COLUMNS = ("env_steps", "method", "task", "mean", "standard_error", "lower", "upper", "seeds", "tasks", "kind")
 
 
@@ -160,8 +160,3 @@ def _cell(row, tasks: int) -> str:
     if not np.isnan(row.seeds):
         text += f" ({row.seeds:.0f})"
     return text + (f", {row.tasks} of {tasks} tasks" if row.tasks < tasks else "")
-
-
-def escape(name: str) -> str:
-    """A name within a row of a Markdown table."""
-    return name.replace("|", "\\|")

@@ -11,6 +11,13 @@ RANKS = ("best", "second_best")
 """Columns beside those of methods, so no names for methods."""
 AGGREGATE = "Normalized aggregate"
 """The name of the row over all tasks in tables of normalised numbers."""
+DASH = "–"
+"""An unavailable value."""
+
+
+def escape(name: object) -> str:
+    """A name within a row of a Markdown table."""
+    return str(name).replace("|", "\\|")
 
 
 def result_table(values: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[str], column: str) -> pd.DataFrame:
@@ -83,14 +90,14 @@ def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, i
     | t | *1.0* (1) | **2.0** (2) |
     """
     ranks = rank_methods(table)
-    names = [str(name).replace("|", "\\|") for name in table.columns]
+    names = [escape(name) for name in table.columns]
     lines = ["| task | " + " | ".join(names) + " |", "|---" * (1 + len(table.columns)) + "|"]
     for task, row in table.iterrows():
         decimals = digits if isinstance(digits, int) else digits.get(task, digits[AGGREGATE])
         cells = []
         for method, value in row.items():
             if np.isnan(value):
-                cells.append("–")
+                cells.append(DASH)
                 continue
             mark = {ranks.loc[task, "best"]: "**", ranks.loc[task, "second_best"]: "*"}.get(method, "")
             count = seeds.loc[task, method]

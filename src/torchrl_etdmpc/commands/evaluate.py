@@ -14,7 +14,7 @@ from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
-from torchrl_etdmpc.envs import Task, make_env, render_frame, success_return
+from torchrl_etdmpc.envs import Task, env_sizes, make_env, render_frame, success_return
 from torchrl_etdmpc.envs.layers import simulator_of
 from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.planners import BarePolicy
@@ -69,13 +69,7 @@ def main(config: EvaluateConfig) -> None:
     device = resolve_device(config.device)
     task = config.task_spec
     env = make_env(task, seed=config.seed, num_envs=config.episodes, parallel=False)  # side by side
-    agent, trained, counters = load_agent(
-        config.checkpoint,
-        observation_dim=env.observation_spec["observation"].shape[-1],
-        action_dim=env.action_spec.shape[-1],
-        device=device,
-        compile_setting="off",
-    )
+    agent, trained, counters = load_agent(config.checkpoint, **env_sizes(env), device=device, compile_setting="off")
     if config.policy == "planner":
         policy = config.planner_of(agent)
         env = env.append_transform(policy.make_tensordict_primer())

@@ -15,7 +15,7 @@ from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, trained_with, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
-from torchrl_etdmpc.envs import Task, make_env
+from torchrl_etdmpc.envs import Task, env_sizes, make_env
 from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page import make_page, serve
 from torchrl_etdmpc.inspector.saved_page import free_folder, plotly_script, write_page
@@ -116,10 +116,7 @@ def _inspection(config: InspectConfig) -> Inspection:
 def _sizes(task: Task) -> dict[str, int]:
     env = make_env(task)
     env.close(raise_if_closed=False)
-    return {
-        "observation_dim": env.observation_spec["observation"].shape[-1],
-        "action_dim": env.action_spec.shape[-1],
-    }
+    return env_sizes(env)
 
 
 def _need_no_renderer(task: Task) -> None:

@@ -324,12 +324,12 @@ def reached(runs: Table) -> int:
     return int(ends(runs).min())
 
 
-def missing(lines: list[str], shown: int = 5) -> str:
+def missing(lines: list[str]) -> str:
     """What the line for the terminal says of runs that are missing or not finished."""
     if not lines:
         return ""
-    more = f"; and {len(lines) - shown} more" if len(lines) > shown else ""
-    return f"; {len(lines)} missing or unfinished ({'; '.join(lines[:shown])}{more})"
+    more = f"; and {len(lines) - 5} more" if len(lines) > 5 else ""
+    return f"; {len(lines)} missing or unfinished ({'; '.join(lines[:5])}{more})"
 
 
 def refuse_clash(methods: list[str], tables: list[Table]) -> None:

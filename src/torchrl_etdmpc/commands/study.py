@@ -7,7 +7,6 @@ import importlib
 import importlib.util
 import io
 import json
-import platform
 import re
 import sys
 from collections.abc import Sequence
@@ -22,12 +21,12 @@ import torch
 from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
-from torchrl_etdmpc.envs import make_env
+from torchrl_etdmpc.envs import env_sizes, make_env
 from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
 from torchrl_etdmpc.inspector.studies import choose_states
 from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.runs import first_line, library_versions, progress_bar, replacing
+from torchrl_etdmpc.runs import first_line, library_versions, processor, progress_bar, replacing
 from torchrl_etdmpc.runs.files import make_folder, write_whole
 from torchrl_etdmpc.training import load_agent, resolve_device
 
@@ -83,13 +82,7 @@ def _main(config: StudyConfig) -> None:
         raise ImportError("this command needs matplotlib; run: pip install matplotlib")
     task, device = config.task_spec, resolve_device(config.device)
     env = make_env(task, seed=config.seed)
-    agent, _, counters = load_agent(
-        config.checkpoint,
-        observation_dim=env.observation_spec["observation"].shape[-1],
-        action_dim=env.action_spec.shape[-1],
-        device=device,
-        compile_setting="off",
-    )
+    agent, _, counters = load_agent(config.checkpoint, **env_sizes(env), device=device, compile_setting="off")
     env.close(raise_if_closed=False)
     folder = Path(config.out).expanduser()
     make_folder(folder)
@@ -109,7 +102,7 @@ def _main(config: StudyConfig) -> None:
         "states_asked": config.states,
         "seed": config.seed,
         "device": str(device),
-        "processor": _processor(),
+        "processor": processor(),
         "threads": torch.get_num_threads(),
         "versions": library_versions(),
     }
@@ -185,10 +178,3 @@ def _write(folder: Path, name: str, module: ModuleType, result: Any, about: dict
 
 def _short(value: Any) -> Any:
     return f"{value:.5g}" if isinstance(value, float) else value
-
-
-def _processor() -> str:
-    """The CPU's name where the system tells it."""
-    file = Path("/proc/cpuinfo")
-    names = re.findall(r"^model name\s*: (.+)$", file.read_text(), re.M) if file.exists() else []
-    return f"{platform.machine()} ({names[0]})" if names else platform.machine()

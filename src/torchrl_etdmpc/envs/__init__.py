@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_etdmpc.envs.check import check_env, check_spaces
+from torchrl_etdmpc.envs.check import check_env, check_spaces, env_sizes
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.make import make_env
 from torchrl_etdmpc.envs.render import render_frame
@@ -27,6 +27,7 @@ __all__ = [
     "Task",
     "check_env",
     "check_spaces",
+    "env_sizes",
     "get_task",
     "import_attribute",
     "import_task",

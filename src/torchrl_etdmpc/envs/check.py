@@ -105,6 +105,25 @@ def model_sizes(model: Any) -> dict[str, Any]:
     }
 
 
+def env_sizes(env: EnvBase) -> dict[str, int]:
+    """The sizes that a model of an environment is built with.
+
+    Args:
+        env (EnvBase): one that :func:`make_env` made, or with its keys.
+
+    Returns:
+        dict: ``observation_dim`` and ``action_dim``.
+
+    >>> from torchrl_etdmpc.testing import LQRWorld
+    >>> env_sizes(LQRWorld())
+    {'observation_dim': 2, 'action_dim': 1}
+    """
+    return {
+        "observation_dim": env.observation_spec["observation"].shape[-1],
+        "action_dim": env.action_spec.shape[-1],
+    }
+
+
 _ANY_SIZE = -1
 
 

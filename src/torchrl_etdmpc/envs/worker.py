@@ -23,7 +23,8 @@ from torchrl_etdmpc.envs.seeding import seed_everything
 _PATIENCE_S = 300
 # How often a worker process looks for its owner after a signal to stop, in seconds.
 _GRACE_S = 10
-_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)}
+# Signals to stop: of the keyboard, of SLURM and of Kubernetes.
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGUSR1") if hasattr(signal, name))
 
 
 @contextlib.contextmanager
@@ -36,7 +37,7 @@ def signals_held_back() -> Iterator[None]:
         yield
         return
     resource_tracker.ensure_running()  # starting it would let SIGINT and SIGTERM through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # processes inherit it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # processes inherit it
     try:
         yield
     finally:
@@ -45,10 +46,10 @@ def signals_held_back() -> Iterator[None]:
 
 def take_signals(handler: Any) -> None:
     """In a worker: answers signals to stop from now on, also the one that has been held back."""
-    for number in _SIGNALS:
+    for number in STOP_SIGNALS:
         signal.signal(number, handler)
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
 
 
 def start_workers(env: ParallelEnv) -> None:
@@ -62,21 +63,18 @@ def start_workers(env: ParallelEnv) -> None:
         env.BATCHED_PIPE_TIMEOUT = _PATIENCE_S
 
 
-def start_workers_anew(env: EnvBase) -> bool:
+def start_workers_anew(env: EnvBase) -> None:
     """After a failure: ends the processes of a :class:`~torchrl.envs.ParallelEnv` and starts new ones.
 
     One that died, hangs or has answered half a question would fail every later step, too. The new ones get new seeds,
-    drawn from PyTorch's generator.
+    drawn from PyTorch's generator. Other environments are left as they are.
 
     Args:
         env (EnvBase): with any transforms around it.
-
-    Returns:
-        bool: whether it steps in processes of its own.
     """
     env = simulator_of(env)
     if not isinstance(env, ParallelEnv) or env.is_closed or not env._owns_workers:
-        return False
+        return
     for process in env._workers:
         with contextlib.suppress(ValueError):  # closed by now
             process.kill()
@@ -86,7 +84,6 @@ def start_workers_anew(env: EnvBase) -> bool:
     env.is_closed = True
     start_workers(env)
     env.set_seed(int(torch.randint(2**31, ())))
-    return True
 
 
 def make_in_worker(make: Callable[..., EnvBase], owner: int) -> EnvBase:

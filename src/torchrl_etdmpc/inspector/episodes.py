@@ -49,16 +49,14 @@ class Rolled(NamedTuple):
     """What followed from a sequence of T actions; fewer where the episode ended on the way.
 
     >>> rolled = Simulator("gym/Pendulum-v1").roll(torch.zeros(4, 1))
-    >>> rolled.observation.shape, rolled.reward.shape, rolled.frames
-    (torch.Size([5, 3]), torch.Size([4]), None)
+    >>> rolled.observation.shape, rolled.reward.shape
+    (torch.Size([5, 3]), torch.Size([4]))
     """
 
     observation: Tensor
     """``[T + 1, O]``, the one before the first action included."""
     reward: Tensor
     """``[T]``"""
-    frames: Tensor | None
-    """uint8 ``[T + 1, height, width, 3]``, if asked for."""
     terminated: bool
     """Whether the last step ended the task."""
 
@@ -205,20 +203,13 @@ class Simulator:
         return env.restored
 
     @torch.no_grad()
-    def roll(self, actions: Tensor, *, frames: bool = False) -> Rolled:
+    def roll(self, actions: Tensor) -> Rolled:
         """Takes actions from the present state on, until the episode ends.
 
         Args:
             actions (Tensor): in [-1, 1], ``[T, A]``.
-
-        Keyword Args:
-            frames (bool): whether to render every state on the way. Default: ``False``.
-
-        Raises:
-            RuntimeError: if there is no renderer.
         """
         observations, rewards, terminated = [self.observation], [], False
-        pictures = [self.frame()] if frames else []
         for action in actions.to("cpu", torch.float32):
             if self._now[1]:
                 break
@@ -227,10 +218,8 @@ class Simulator:
             observations.append(following["observation"])
             rewards.append(following["reward"].squeeze(-1))
             terminated = bool(following["terminated"])
-            if frames:
-                pictures.append(self.frame())
         reward = torch.stack(rewards) if rewards else torch.zeros(0)
-        return Rolled(torch.stack(observations), reward, torch.stack(pictures) if frames else None, terminated)
+        return Rolled(torch.stack(observations), reward, terminated)
 
     def frame(self, height: int | None = None, width: int | None = None) -> Tensor:
         """A picture of the present state, uint8 ``[height, width, 3]``.

@@ -61,10 +61,11 @@ class GaussianPolicy(LayerStack):
         Returns:
             tuple[Tensor, Tensor]: mean in (-1, 1) and log std, both of shape ``[..., A]``.
         """
-        mean, log_std = self._gaussian(latent, log_std_bounds)
+        mean, log_std = self.before_tanh(latent, log_std_bounds)
         return mean.tanh(), log_std
 
-    def _gaussian(self, latent: Tensor, log_std_bounds: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
+    def before_tanh(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
+        """Mean before its tanh and log std, both of shape ``[..., A]``."""
         mean, raw = self.through(latent).chunk(2, dim=-1)
         return mean, bounded_log_std(raw, *(log_std_bounds or self.log_std_bounds))
 
@@ -91,7 +92,3 @@ class SquashedGaussianPolicy(GaussianPolicy):
         """Mean and log std of actions, to first order in the std before the tanh, to which the bounds apply."""
         mean, log_std = self.before_tanh(latent, log_std_bounds)
         return mean.tanh(), log_std + tanh_log_slope(mean)
-
-    def before_tanh(self, latent: Tensor, log_std_bounds: tuple[float, float] | None = None) -> tuple[Tensor, Tensor]:
-        """Mean and log std of the Gaussian before the tanh, both of shape ``[..., A]``."""
-        return self._gaussian(latent, log_std_bounds)

@@ -102,8 +102,9 @@ class EfficientTDMPCModelLoss(LatentRolloutLoss):
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5. The termination term is not
             decayed: a terminal state is always the last of its slice, so a decay would bias the predicted probability.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
-            head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an
-            error; on CUDA, where looking would wait for the device, nothing is checked. Default: ``False``.
+            head: nothing then learns that an episode can end, and who plans with the model imagines on. Otherwise
+            such a row on the CPU is an error; on CUDA, where looking would wait for the device, nothing is checked.
+            Default: ``False``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[B, T]``).
 
     Raises:

@@ -25,9 +25,6 @@ class Trajectories:
         self._size = 0
         self._open: dict[tuple[int, ...], int] = {}  # id -> its running trajectory
 
-    def __len__(self) -> int:
-        return self._size
-
     @property
     def lengths(self) -> np.ndarray:
         """Rows per trajectory, those that were overwritten included."""
@@ -164,9 +161,7 @@ class Trajectories:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores :meth:`state_dict`."""
         start, stride, length, place = np.asarray(state_dict["segments"], dtype=np.int64)
-        if "ended" not in state_dict:  # of version 0.2: a trajectory was one segment, and the last column its id
-            place = np.arange(len(place))
-        ended = np.asarray(state_dict.get("ended", np.zeros(len(place))), dtype=bool)
+        ended = np.asarray(state_dict["ended"], dtype=bool)
         within = np.arange(length.sum()) - np.repeat(length.cumsum() - length, length)
         numbers = np.repeat(start, length) + within * np.repeat(stride, length)
         self._set(numbers, np.bincount(place, weights=length, minlength=len(ended)).astype(np.int64), ended)

@@ -18,6 +18,8 @@ from typing import Any
 
 import torch
 
+from torchrl_etdmpc.runs.machine import machine_memory
+
 
 class DamagedFileError(RuntimeError):
     """A file that is missing or is not what was written."""
@@ -114,7 +116,7 @@ def read_whole(path: Path, limit: int | None = None) -> bytes:
     Raises:
         DamagedFileError: if it is missing, is something else than a file or is larger.
     """
-    most = _memory() // 4
+    most = (machine_memory() or 2**34) // 4
     limit = most if limit is None else min(limit, most)
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe without a writer would wait
@@ -130,13 +132,6 @@ def read_whole(path: Path, limit: int | None = None) -> bytes:
             os.close(descriptor)
     except OSError as error:
         raise DamagedFileError(f"{path} cannot be read ({error.strerror}).") from error
-
-
-def _memory() -> int:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # Windows
-        return 2**34
 
 
 def pack_tensors(content: Any) -> bytes:

@@ -48,7 +48,6 @@ def progress_bar(
         desc=f"{phase:12}",
         disable=None,  # silent when stderr is not a terminal
         leave=not passing,
-        position=None,
         dynamic_ncols=True,
         smoothing=0,  # evaluations and checkpoints interrupt a phase; its average holds them in their share
         bar_format="{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {unit}, {remaining} left{postfix}",

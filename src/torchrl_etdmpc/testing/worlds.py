@@ -306,18 +306,16 @@ def _quadratic(x: Tensor, matrix: Tensor) -> Tensor:
     return ((x @ matrix.to(x.dtype)) * x).sum(-1)
 
 
-def _solve_riccati(
-    a: Tensor, b: Tensor, q: Tensor, r: Tensor, discount: float, *, iterations: int = 10_000, tolerance: float = 1e-12
-) -> tuple[Tensor, Tensor]:
+def _solve_riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, discount: float) -> tuple[Tensor, Tensor]:
     """P ``[O, O]`` and K ``[A, O]`` by value iteration."""
     value = q
-    for _ in range(iterations):
+    for _ in range(10_000):
         gain = discount * torch.linalg.solve(r + discount * b.mT @ value @ b, b.mT @ value @ a)
         following = q + discount * a.mT @ value @ (a - b @ gain)
-        if torch.allclose(following, value, rtol=tolerance, atol=tolerance):
+        if torch.allclose(following, value, rtol=1e-12, atol=1e-12):
             return following, gain
         value = following
     raise ValueError(
-        f"the Riccati equation has no solution after {iterations} iterations: the controls cannot keep the cost "
+        "the Riccati equation has no solution after 10,000 iterations: the controls cannot keep the cost "
         f"finite; choose a smaller discount than {discount} or other matrices."
     )

@@ -95,7 +95,6 @@ def build_replay(
     >>> build_replay(preset("cpu")).batch_size  # 64 slices of 3
     192
     """
-    rows = min(config.replay.capacity, config.total_decisions + config.num_envs)
     with named_settings("loss", config.loss):
         sampler = StepSliceSampler(
             config.loss.slice_len,
@@ -104,6 +103,7 @@ def build_replay(
             partial=config.partial_slices,
             as_slices=True,
         )
+    rows = config.replay_rows
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(rows, device=replay_device(config, device, rows * row_bytes(*sizes))),
         sampler=sampler,

@@ -353,6 +353,11 @@ class TrainConfig:
         return slices * self.loss.slice_len
 
     @property
+    def replay_rows(self) -> int:
+        """Rows of the buffer: as many as the budget can fill, at most its capacity."""
+        return min(self.replay.capacity, self.total_decisions + self.num_envs)
+
+    @property
     def partial_slices(self) -> bool:
         """Whether slices may begin in the last steps of an ended episode, so that batches are masked."""
         # Departure from BMPC, whose slices lie within an episode: its last steps then never begin a slice, and what is

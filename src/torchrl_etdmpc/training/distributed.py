@@ -125,7 +125,7 @@ class WorkerCollector:
     >>> collector.shutdown()
     """
 
-    begins_fresh = False  # workers begin fresh episodes, each from a seed of its own
+    begins_fresh = True  # workers begin new episodes, each from a seed of its own
 
     def __init__(
         self, config: DistributedConfig, agent: Agent, env: EnvBase, replay_buffer: ReplayBuffer, *, exclude_keys: tuple

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
+from torchrl_etdmpc.envs import env_sizes
 from torchrl_etdmpc.runs import IntervalMeans
 from torchrl_etdmpc.training.agent import build_agent
 from torchrl_etdmpc.training.builders import (
@@ -52,10 +53,10 @@ class Learner:
     def __init__(self, config: TrainConfig, env: EnvBase) -> None:
         self.config = config
         device = resolve_device(config.device)
-        sizes = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-        require_memory(config, *sizes, device)
-        self.agent = build_agent(config, *sizes, device)
-        self.replay = build_replay(config, device, sizes=sizes)
+        sizes = env_sizes(env)
+        require_memory(config, **sizes, device=device)
+        self.agent = build_agent(config, **sizes, device=device)
+        self.replay = build_replay(config, device, sizes=(sizes["observation_dim"], sizes["action_dim"]))
         self.reanalyze = build_reanalyze(config, self.agent, self.replay)
         self.collector = build_collector(config, self.agent, env, self.replay)
         self.pretrained = self.faults = self.faults_in_a_row = 0

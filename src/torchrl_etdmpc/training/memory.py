@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 
+from torchrl_etdmpc.runs import machine_memory
 from torchrl_etdmpc.training.builders import replay_device, row_bytes
 from torchrl_etdmpc.training.config import ModelConfig, PlannerConfig, TrainConfig
 
@@ -24,8 +23,8 @@ def require_memory(config: TrainConfig, observation_dim: int, action_dim: int, d
     Raises:
         ValueError: if a part alone needs more than its device has in all.
     """
-    model, rows = config.model, min(config.replay.capacity, config.total_decisions + config.num_envs)
-    replay = rows * row_bytes(observation_dim, action_dim)
+    model = config.model
+    replay = config.replay_rows * row_bytes(observation_dim, action_dim)
     weights = 5 * _FLOAT * _parameters(model, observation_dim, action_dim)  # targets, gradient and two moments as well
     parts = {
         "replay.capacity": (replay, replay_device(config, device, replay)),
@@ -45,12 +44,7 @@ def require_memory(config: TrainConfig, observation_dim: int, action_dim: int, d
 
 def _memory_bytes(device: torch.device) -> int | None:
     """All the memory of a device; ``None`` where it cannot be told."""
-    if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[1]
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return None
+    return torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else machine_memory()
 
 
 def _parameters(model: ModelConfig, observation_dim: int, action_dim: int) -> int:

@@ -15,13 +15,9 @@ from torchrl_etdmpc.training.config import (
 )
 
 
-def _preset(name: str, **changes: Any) -> TrainConfig:
-    return TrainConfig(preset=name, **changes)
-
-
 def _efficient_tdmpc(name: str, updates_per_decision: int, reanalyze_every: int, beta: float = 0.0) -> TrainConfig:
-    return _preset(
-        name,
+    return TrainConfig(
+        preset=name,
         optim=OptimConfig(updates_per_decision=updates_per_decision),
         reanalyze=ReanalyzeConfig(every=reanalyze_every, beta=beta),
     )
@@ -63,22 +59,22 @@ PRESETS: dict[str, TrainConfig] = {
         _efficient_tdmpc("efficient-tdmpc-utd2", updates_per_decision=2, reanalyze_every=5),
         _efficient_tdmpc("efficient-tdmpc-utd4", updates_per_decision=4, reanalyze_every=2),
         _efficient_tdmpc("humanoidbench", updates_per_decision=4, reanalyze_every=2, beta=10.0),
-        _preset(
-            "bmpc",
+        TrainConfig(
+            preset="bmpc",
             model=ModelConfig(num_dynamics=1),
             planner=PlannerConfig(horizon=3, score="final", eval_first_action="elite"),
             reanalyze=ReanalyzeConfig(num_samples=512, num_elites=64, num_proposals=24),
             replay=ReplayConfig(insertion="episode"),
         ),
-        _preset(
-            "tdmpc2",
+        TrainConfig(
+            preset="tdmpc2",
             model=ModelConfig(**_TDMPC2_MODEL),
             planner=PlannerConfig(**_TDMPC2_PLANNER),
             reanalyze=ReanalyzeConfig(every=0),
             replay=ReplayConfig(insertion="episode", pretrain_policy=True),
         ),
-        _preset(
-            "cpu",
+        TrainConfig(
+            preset="cpu",
             **_CPU_RUN,
             model=ModelConfig(num_dynamics=2, normalize_observations=True, **_CPU_MODEL),
             planner=PlannerConfig(horizon=3, **_CPU_PLANNER),
@@ -92,8 +88,8 @@ PRESETS: dict[str, TrainConfig] = {
             # 1,000 for its 2,500, for the time that a CPU takes.
             replay=ReplayConfig(pretrain_updates=1000),
         ),
-        _preset(
-            "tdmpc2-cpu",
+        TrainConfig(
+            preset="tdmpc2-cpu",
             **_CPU_RUN,
             loss=LossConfig(tau=0.03),
             model=ModelConfig(**_TDMPC2_MODEL, **_CPU_MODEL),

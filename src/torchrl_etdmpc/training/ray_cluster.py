@@ -13,6 +13,9 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
+from torchrl_etdmpc.envs.worker import STOP_SIGNALS
+from torchrl_etdmpc.runs import first_line
+
 _OBJECT_STORE_BYTES = 128 * 2**20  # batches of rows pass through it, and nothing else
 _REACH_S = 10.0
 
@@ -20,8 +23,7 @@ _REACH_S = 10.0
 @contextlib.contextmanager
 def _same_signals() -> Iterator[None]:
     """Leaves the handlers of signals as they were."""
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     try:
         yield
     finally:
@@ -65,8 +67,9 @@ class RayCluster:
         except Exception as error:
             self.close()
             where = "a local Ray cluster cannot be started" if address is None else f"address={address} is no cluster"
-            text = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise OSError(f"{where} ({text.rstrip('.')}); leave address out for one, or another engine.") from error
+            raise OSError(
+                f"{where} ({first_line(error).rstrip('.')}); leave address out for one, or another engine."
+            ) from error
         there = int(ray.cluster_resources().get("CPU", 0))
         if there < workers:
             self.close()

@@ -10,9 +10,10 @@ from typing import Any
 
 from torchrl import torchrl_logger
 
+from torchrl_etdmpc.envs.worker import STOP_SIGNALS
+
 EXIT_CODE = 75
 """Of a run that was asked to stop and can go on (EX_TEMPFAIL of sysexits.h)."""
-_NAMES = ("SIGTERM", "SIGINT", "SIGUSR1")  # what SLURM and Kubernetes send, and the keyboard
 
 
 class RunInterrupted(Exception):
@@ -41,10 +42,7 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
-            for name in _NAMES:
-                if hasattr(signal, name):
-                    number = getattr(signal, name)
-                    self._before[number] = signal.signal(number, self._handle)
+            self._before = {number: signal.signal(number, self._handle) for number in STOP_SIGNALS}
         return self
 
     def __exit__(

@@ -32,7 +32,7 @@ class WorldSimulator:
             rewards.append(self.world.reward(self.latent, action))
             self.latent = self.world.transition(self.latent, action)
             observations.append(self.observation)
-        return Rolled(torch.stack(observations), torch.stack(rewards), None, False)
+        return Rolled(torch.stack(observations), torch.stack(rewards), False)
 
 
 class EndingSimulator(WorldSimulator):

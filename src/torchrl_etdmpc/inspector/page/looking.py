@@ -6,11 +6,11 @@ from typing import Any
 
 from torchrl_etdmpc.inspector import figures
 from torchrl_etdmpc.inspector.inspection import Inspection
-from torchrl_etdmpc.inspector.saved_page import facts_of, frames_of, setting_rows
+from torchrl_etdmpc.inspector.saved_page import MOVING, facts_of, frames_of, setting_rows
 from torchrl_etdmpc.inspector.trace import Trace
 
-_MOVING = ("latent_plane", "return_table", "disagreement", "plan_gaussian", "mixture_weights")
-_STANDS = [name for name in figures.FIGURES if name not in _MOVING]
+_ANSWERED = (*MOVING, "mixture_weights")  # which follows the candidate alone
+_STANDS = [name for name in figures.FIGURES if name not in _ANSWERED]
 
 
 def connect_figures(app: Any, inspection: Inspection) -> None:
@@ -85,7 +85,7 @@ def _connect_moving(app: Any, inspection: Inspection) -> None:
     for side in "ab":
         trace, candidate = Input(f"trace-{side}", "data"), Input(f"candidate-{side}", "data")
         iteration, depth, components = (Input(name, "value") for name in ("iteration", "depth", "components"))
-        outputs = {name: Output(f"{name}-{side}", "figure") for name in _MOVING}
+        outputs = {name: Output(f"{name}-{side}", "figure") for name in _ANSWERED}
 
         # The browser moves the ring around a candidate, so that a click does not draw the plane anew.
         @app.callback(

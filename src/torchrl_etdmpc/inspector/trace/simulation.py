@@ -31,7 +31,7 @@ def add_simulation(
     >>> simulator = Simulator("gym/Pendulum-v1")
     >>> trace = trace_plan(planner, simulator.observation)
     >>> rolled = simulator.roll(torch.from_numpy(trace["chosen_actions"]))
-    >>> both = add_simulation(trace, rolled.reward, rolled.observation, rolled.frames, model)
+    >>> both = add_simulation(trace, rolled.reward, rolled.observation, None, model)
     >>> both["chosen_rewards"].shape, both["real_rewards"].shape  # [H, F] imagined, [R] real
     ((3, 4), (3,))
     """
