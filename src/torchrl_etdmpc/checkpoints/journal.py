@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer, TensorStorage
 
-from torchrl_etdmpc.keys import TARGETS
+from torchrl_etdmpc.keys import PLAN, TARGETS
 from torchrl_etdmpc.runs.files import DamagedFileError, read_tensors, remove_partial_files, write_tensors
 
 ROWS_PER_FILE = 16_384
@@ -52,7 +52,7 @@ class ReplayJournal:
     [0, 1, 2, 3, 4, 5, 6]
     """
 
-    def __init__(self, folder: str | Path, *, plan_key: NestedKey = "plan", rewrite_at: float = 1 / 3) -> None:
+    def __init__(self, folder: str | Path, *, plan_key: NestedKey = PLAN, rewrite_at: float = 1 / 3) -> None:
         self.folder = Path(folder)
         self.rewrite_at = rewrite_at
         self._target_keys = [unravel_key((plan_key, name)) for name in TARGETS]

@@ -20,7 +20,7 @@ from torchrl_etdmpc.collectors.errors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.collectors.evaluate import fitting_primers
 from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
 from torchrl_etdmpc.envs.worker import start_workers_anew
-from torchrl_etdmpc.keys import TRAJECTORY
+from torchrl_etdmpc.keys import FALLBACK, NEXT, PLAN, PLAN_MEAN, TRAJECTORY
 from torchrl_etdmpc.runs.errors import first_line
 
 Insertion = Literal["step", "episode"]
@@ -87,7 +87,7 @@ class StepCollector(BaseCollector):
         init_random_frames: int = 0,
         seed_policy: nn.Module | None = None,
         insertion: Insertion = "step",
-        exclude_keys: Sequence[NestedKey] = ("plan_mean", ("next", "plan_mean"), ("plan", "fallback")),
+        exclude_keys: Sequence[NestedKey] = (PLAN_MEAN, (NEXT, PLAN_MEAN), (PLAN, FALLBACK)),
         exploration_type: ExplorationType = ExplorationType.RANDOM,
         policy_device: torch.device | str | None = None,
     ) -> None:

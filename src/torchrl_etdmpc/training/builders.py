@@ -8,7 +8,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorDictRo
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import SeedPolicy, StepCollector
-from torchrl_etdmpc.keys import NEXT, TRAJECTORY, WORKER
+from torchrl_etdmpc.keys import DONE, FALLBACK, IS_INIT, NEXT, PLAN, PLAN_MEAN, TERMINATED, TRAJECTORY, WORKER
 from torchrl_etdmpc.replay import ReanalyzeTransform, StepSliceSampler
 from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.config import TrainConfig, check_device, named_settings
@@ -16,8 +16,15 @@ from torchrl_etdmpc.training.distributed import DistributedConfig, WorkerCollect
 
 # What an environment or a policy writes and nothing reads from a stored row: less to write at every step.
 UNREAD = (
-    *("plan_mean", "is_init", "episode_reward", "done", "terminated", "truncated", ("plan", "fallback")),
-    *(("next", "plan_mean"), ("next", "is_init")),
+    PLAN_MEAN,
+    (NEXT, PLAN_MEAN),
+    IS_INIT,
+    (NEXT, IS_INIT),
+    "episode_reward",
+    DONE,
+    TERMINATED,
+    "truncated",
+    (PLAN, FALLBACK),
 )
 
 

@@ -192,7 +192,9 @@ class Updater:
         self._follow()
         self.loss.world_model.version += 1
         self._average()
-        return TensorDict(metrics, batch_size=[]).clone()
+        # One copy for all: the memory may be that of a CUDA graph.
+        copies = torch.stack([*metrics.values()]).unbind()
+        return TensorDict(dict(zip(metrics, copies, strict=True)), batch_size=[])
 
     def _follow(self) -> None:
         """Moves the targets, of which most losses have those of the values alone."""
