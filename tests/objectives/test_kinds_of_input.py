@@ -306,3 +306,11 @@ def test_no_slices_at_all_are_refused(make_loss, training):
     batch = random_slices(5, 3)[:0]
     with pytest.raises(ValueError, match=r"needs at least one step, got \[0, 3\] slices\.$"):
         loss(batch)
+
+
+def test_a_loss_of_weights_in_double_precision_has_such_numbers():
+    for dtype in (torch.float64, torch.bfloat16):
+        loss = EfficientTDMPCLoss(WorldModel(5, 3, latent_dim=16, mlp_dim=16).to(dtype), discount=0.99, rho=0.3)
+        numbers = {buffer.dtype for buffer in loss.buffers() if buffer.ndim == 0 and buffer.is_floating_point()}
+        assert numbers == {torch.promote_types(dtype, torch.float32)}
+        assert (loss.discount.item() == 0.99) == (loss.rho.item() == 0.3) == (dtype == torch.float64)

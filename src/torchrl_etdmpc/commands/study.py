@@ -149,7 +149,8 @@ def _study(
         "value_bias": max(decisions // 2, 1),  # so that what the time limit cut off weighs little
         "advantage": window,
     }
-    states = choose_states(episodes, config.states, ahead=ahead.get(name, 1), seed=config.seed)
+    limit = config.task_spec.decision_steps_per_episode
+    states = choose_states(episodes, config.states, ahead=ahead.get(name, 1), limit=limit, seed=config.seed)
     study = getattr(module, name)
     if name == "value_bias":
         return study(planner, episodes, states, seed=config.seed)

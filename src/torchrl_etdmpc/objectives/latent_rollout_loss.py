@@ -29,6 +29,11 @@ _REDUCTIONS = get_args(Reduction)
 _RUNNING_SCALES = ("kl_scale", "q_scale")
 
 
+def _scalar_dtype(world_model: WorldModel) -> torch.dtype:
+    """Of coefficients and scales: that of the weights, at least float32; in it 0.99 is a discount of 0.99."""
+    return torch.promote_types(world_model.bins.dtype, torch.float32)
+
+
 def _check_reduction(reduction: str) -> None:
     if reduction not in _REDUCTIONS:
         raise ValueError(f"reduction must be one of {', '.join(_REDUCTIONS)}, got {reduction!r}.")
@@ -170,16 +175,16 @@ class LatentRolloutLoss(SharedNetworksLoss):
         check_terms(terms, extra_terms, networks=self._attributes, reserved=reserved)
         trained = {name for term in self.terms for name in term.networks}
         self._share_networks(trained, {name for term in self.terms for name in term.targets})
-        device = world_model.version.device
+        like = {"device": world_model.version.device, "dtype": _scalar_dtype(world_model)}
         for term in self.terms:
             numbers = {f"{term.name}_coef": term.coef, **term.scalars}
             for name, number in numbers.items():
                 if not math.isfinite(number):
                     raise ValueError(f"{name} must be finite, got {number}.")
-                self.register_coeff_buffer(name, float(number), device=device)
+                self.register_coeff_buffer(name, float(number), **like)
             if isinstance(term.function, nn.Module):
                 self.add_module(term.name, term.function)
-        self.register_buffer("rho", torch.tensor(float(rho), device=device))
+        self.register_buffer("rho", torch.tensor(float(rho), **like))
         self.distill = True
         count_updates(world_model, self.parameters())
 

@@ -86,7 +86,7 @@ def register_q_scale(loss: LatentRolloutLoss, scale_tau: float) -> None:
     if not 0 <= scale_tau <= 1:
         raise ValueError(f"scale_tau must be in [0, 1], got {scale_tau}.")
     loss.scale_tau = scale_tau
-    loss.register_buffer("q_scale", torch.ones((), device=loss.rho.device))
+    loss.register_buffer("q_scale", torch.ones_like(loss.rho))
 
 
 def max_q_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float, squashed_entropy: bool) -> Term:

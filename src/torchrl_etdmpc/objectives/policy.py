@@ -122,7 +122,7 @@ def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_directi
     _check_direction(kl_direction)
     loss.scale_tau = scale_tau
     loss.kl_direction = kl_direction
-    loss.register_buffer("kl_scale", torch.ones((), device=loss.rho.device))
+    loss.register_buffer("kl_scale", torch.ones_like(loss.rho))
 
 
 def _check_direction(kl_direction: str) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchrl_etdmpc.inspector.studies.replan import true_returns
 from torchrl_etdmpc.inspector.studies.states import choose_states, episode_interval, roll_all
 from torchrl_etdmpc.testing import LineWorld
 
@@ -33,6 +34,12 @@ def test_every_decision_counts_of_an_episode_that_ended_its_task(make_episodes):
     states = choose_states([cut, ended._replace(terminated=True)], 100, ahead=3)
     assert states.step[states.episode == 0].tolist() == [0, 1, 2]
     assert states.step[states.episode == 1].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_of_an_episode_that_ended_no_state_has_the_time_limit_ahead(make_episodes):
+    ended = make_episodes(LineWorld(), torch.zeros_like, count=1, steps=5)[0]._replace(terminated=True)
+    for limit, last in ((5, 2), (6, 3), (7, 4), (100, 4)):  # its fifth decision ended it
+        assert choose_states([ended], 100, ahead=3, limit=limit).step.tolist() == list(range(last + 1))
 
 
 def test_no_states_are_an_error(make_episodes):
@@ -79,3 +86,18 @@ def test_nothing_is_earned_or_observed_after_the_end(make_episodes, WorldSimulat
     whole, _, lives = roll_all(WorldSimulator(world), states, torch.ones(3, 4, 1))
     assert lives.all()
     assert torch.allclose(whole[:, -1] - whole[:, 0], torch.tensor(2.0))
+
+
+def test_what_follows_a_time_limit_is_unknown(make_planner, make_episodes, WorldSimulator):
+    class CutSimulator(WorldSimulator):
+        def roll(self, actions):
+            return super().roll(actions[:2])
+
+    world = LineWorld(value_offset=torch.tensor([100.0]))
+    states = choose_states(make_episodes(world, torch.zeros_like), 3, ahead=4)
+    observation, reward, alive = roll_all(CutSimulator(world), states, torch.ones(3, 4, 1))
+    assert alive.all()
+    assert reward[:, 2:].isnan().all()
+    returns = true_returns(make_planner(world), observation, reward, alive)
+    assert (returns[:, :2] > 50).all()
+    assert returns[:, 2:].isnan().all()

@@ -55,7 +55,9 @@ class TrueWorld(Protocol):
         ...
 
 
-def choose_states(episodes: Sequence[Episode], count: int, *, ahead: int = 0, seed: int = 0) -> States:
+def choose_states(
+    episodes: Sequence[Episode], count: int, *, ahead: int = 0, limit: int | None = None, seed: int = 0
+) -> States:
     """Draws states of episodes evenly, without repeats; all there are if there are not so many.
 
     Args:
@@ -65,16 +67,21 @@ def choose_states(episodes: Sequence[Episode], count: int, *, ahead: int = 0, se
     Keyword Args:
         ahead (int): how many decisions have to follow a state in an episode that was cut. Of one that ended its task
             every decision counts: all that followed is known. Default: 0.
+        limit (int, optional): the task's time limit, in decisions. Other actions may live where an episode ended, and
+            what would follow the limit is unknown: no state has it ``ahead``. Default: none.
         seed (int): of the draw.
 
     Raises:
         ValueError: if no state has so many decisions after it.
     """
-    places = [
-        (number, step)
-        for number, episode in enumerate(episodes)
-        for step in range(len(episode.reward) + 1 - max(0 if episode.terminated else ahead, 1))
-    ]
+    places = []
+    for number, episode in enumerate(episodes):
+        length = len(episode.reward)
+        if not episode.terminated:
+            length += 1 - max(ahead, 1)
+        elif limit is not None:
+            length = min(length, limit + 1 - max(ahead, 1))
+        places += [(number, step) for step in range(length)]
     if count < 1 or not places:
         longest = max((len(episode.reward) for episode in episodes), default=0)
         raise ValueError(
@@ -137,7 +144,8 @@ def roll_all(simulator: TrueWorld, states: States, actions: Tensor) -> tuple[Ten
 
     Returns:
         tuple of Tensor: observations ``[S, H + 1, O]``, rewards ``[S, H]``, and whether the task had not ended
-        ``[S, H + 1]``; after an end nothing is observed, which is NaN, and nothing is earned.
+        ``[S, H + 1]``; after an end nothing is observed, which is NaN, and nothing is earned. After a time limit the
+        rewards are unknown, and NaN.
     """
     size, horizon = actions.shape[:2]
     observation = torch.full((size, horizon + 1, states.observation.shape[-1]), torch.nan)
@@ -148,5 +156,8 @@ def roll_all(simulator: TrueWorld, states: States, actions: Tensor) -> tuple[Ten
         steps = len(rolled.reward)
         observation[index, : steps + 1] = rolled.observation
         reward[index, :steps] = rolled.reward
-        alive[index, steps + (0 if rolled.terminated else 1) :] = False
+        if rolled.terminated:
+            alive[index, steps:] = False
+        else:
+            reward[index, steps:] = torch.nan
     return observation, reward, alive
