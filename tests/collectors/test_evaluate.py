@@ -109,6 +109,7 @@ def test_a_return_equals_that_of_an_independent_rollout():
 def test_several_episodes_of_one_environment_are_counted_apart():
     env = CountingEnv(3)
     assert evaluate(env, ConstantPolicy(), episodes=4).returns.tolist() == [expected_return(3)] * 4
+    assert env.resets == 4  # an environment that resets to a list of starts plays each of them
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 3, 4])

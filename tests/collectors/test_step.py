@@ -31,9 +31,11 @@ from torchrl.envs import (
     ParallelEnv,
     RenameTransform,
     SerialEnv,
+    StepCounter,
     TensorDictPrimer,
     TransformedEnv,
 )
+from torchrl.envs.transforms import VecNormV2
 from torchrl.envs.utils import RandomPolicy, exploration_type
 from torchrl.testing.mocking_classes import CountingEnv, CountingEnvCountPolicy
 
@@ -683,6 +685,29 @@ def test_a_loaded_collector_goes_on_counting_with_fresh_trajectories(insertion):
     assert min(fresh[TRAJ_KEY].tolist()) > max(used)
     for row in (steps[0] for steps in episodes(fresh).values()):
         assert row["observation"][1] == 0
+
+
+@pytest.mark.parametrize("way", ["restored", "others", "not plain"])
+def test_what_transforms_remember_outlives_a_simulator_that_cannot_be_restored(way, monkeypatch):
+    def make(transform):
+        return StepCollector(make_env((9,)).append_transform(transform), RandomActions(), replay_buffer=make_replay())
+
+    first = make(VecNormV2(in_keys=["observation"]))
+    for _ in range(7):
+        first.step()
+    if way == "not plain":
+        monkeypatch.setattr(VecNormV2, "get_extra_state", lambda self: object(), raising=False)
+        monkeypatch.setattr(VecNormV2, "set_extra_state", lambda self, state: None, raising=False)
+    state = first.state_dict()
+    assert state["simulator"] is None
+    second = make(StepCounter() if way == "others" else VecNormV2(in_keys=["observation"]))
+    lost = {"others": "they are others than were saved", "not plain": "what they remember could not be saved"}
+    lost = f", and its transforms begin anew: {lost[way]}" if way in lost else ""
+    with pytest.warns(UserWarning, match=f"^the environment cannot be restored, so fresh episodes begin{lost}.$"):
+        second.load_state_dict(state)
+    if way == "restored":
+        ours, theirs = (collector.env.transform.state_dict()["_extra_state"] for collector in (first, second))
+        assert ours and all(torch.equal(theirs[name], ours[name]) for name in ours)
 
 
 @pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])

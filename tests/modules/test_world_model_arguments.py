@@ -100,6 +100,14 @@ def test_an_encoder_that_acts_differently_in_training_is_refused_unless_it_is_fr
     WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=same)
 
 
+@pytest.mark.parametrize("norm", [nn.utils.parametrizations.spectral_norm, nn.utils.spectral_norm])
+def test_a_spectral_norm_is_estimated_anew_in_every_call_unless_it_is_frozen(norm):
+    encoder = norm(nn.Linear(3, 8))
+    with pytest.raises(ValueError, match=r"acts differently in training, and planning would use it so; .* \.eval\(\)"):
+        WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=encoder)
+    WorldModel(None, 2, latent_dim=8, mlp_dim=8, encoder=encoder.eval())
+
+
 def test_an_observation_of_another_size_is_named():
     model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
     with pytest.raises(

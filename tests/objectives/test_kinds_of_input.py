@@ -314,3 +314,40 @@ def test_a_loss_of_weights_in_double_precision_has_such_numbers():
         numbers = {buffer.dtype for buffer in loss.buffers() if buffer.ndim == 0 and buffer.is_floating_point()}
         assert numbers == {torch.promote_types(dtype, torch.float32)}
         assert (loss.discount.item() == 0.99) == (loss.rho.item() == 0.3) == (dtype == torch.float64)
+
+
+def test_an_observation_that_an_automatic_reset_has_lost_is_refused(make_loss, slices):
+    loss = make_loss("model")
+    slices["next", "done"][1, -1] = True
+    loss(slices)
+    slices["next", "observation"][1, -1] = torch.nan
+    with pytest.raises(
+        ValueError, match=r"^\('next', 'observation'\) is not finite where \('next', 'done'\) is True: an"
+    ):
+        loss(slices)
+    slices["collector", "mask"] = ~slices["next", "done"].squeeze(-1)
+    assert loss(slices)["loss_consistency"].isfinite()
+
+
+def test_actions_beyond_what_planner_and_policy_know_are_a_warning(make_loss, slices):
+    loss = make_loss("whole")
+    slices["action"][0, 0] = 1.0
+    loss(slices)
+    slices["action"][0, 0] = -1.5
+    with pytest.warns(
+        UserWarning, match=r"^'action' leaves \[-1, 1\], where planner and policy look for actions; scale"
+    ):
+        loss(slices)
+
+
+def test_a_network_of_a_world_model_that_no_loss_trains_is_a_warning():
+    class Larger(WorldModel):
+        def __init__(self, *sizes, **options):
+            super().__init__(*sizes, **options)
+            self.embed = torch.nn.Linear(5, 5)
+
+    model = Larger(5, 3, latent_dim=16, mlp_dim=16)
+    with pytest.warns(UserWarning, match="^no loss trains or saves embed of Larger; put it into one of its networks"):
+        EfficientTDMPCLoss(model, discount=0.99)
+    model.embed.requires_grad_(False)
+    EfficientTDMPCLoss(model, discount=0.99)

@@ -42,7 +42,7 @@ def test_entry_b_k_of_an_unreduced_term_belongs_to_slice_b(make_loss, world_mode
     before = run_seeded(loss, slices)
     for key in ("observation", ("next", "observation"), "action", ("next", "reward"), ("plan", "loc")):
         slices[key] = slices[key].clone()
-        slices[key][2] += 0.1
+        slices[key][2] *= 0.9
     slices["next", "terminated"][2] ^= True
     after = run_seeded(loss, slices)
     for term in terms_of[kind]:
@@ -290,3 +290,25 @@ def test_masks_lie_over_the_steps_of_dictionaries_that_are_stacked_lazily(stack_
         found.append(loss(batch))
     for name, value in found[0].items():
         assert torch.equal(found[1][name], value), name
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["a part of a slice", "a whole slice"])
+def test_masked_steps_leave_gradients_finite_of_an_encoder_that_no_zero_may_enter(whole):
+    class Direction(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = nn.Linear(3, 16)
+
+        def forward(self, observation):
+            return simnorm(self.layer(observation / observation.norm(dim=-1, keepdim=True)), 8)
+
+    torch.manual_seed(0)
+    loss = EfficientTDMPCLoss(WorldModel(3, 2, encoder=Direction(), latent_dim=16, mlp_dim=16), discount=0.99).eval()
+    SoftUpdate(loss, tau=0.01)
+    batch = random_slices(3, 2, num_slices=2, slice_len=3)
+    batch["collector", "mask"] = torch.tensor([[not whole, False, False], [True, True, True]])
+    sum(value for name, value in loss(batch).items() if name.startswith("loss_")).backward()
+    assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
+    if whole:
+        alone = loss(batch[1:])["loss_consistency"]
+        torch.testing.assert_close(loss(batch)["loss_consistency"], alone)

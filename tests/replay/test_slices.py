@@ -279,6 +279,14 @@ def test_rows_that_have_the_environment_s_number_alone_are_sliced_by_it_and_thei
     assert _drawn(buffer, 2) == {(0, 2), (2, 5), (1, 3)}
 
 
+def test_rows_that_have_the_environment_s_number_alone_need_the_ends_of_episodes():
+    buffer = _buffer(2)
+    rows = _rows([0] * 6, env_index=torch.zeros(6, dtype=torch.int64)).exclude("collector", "is_init")
+    buffer.extend(rows.exclude(("next", "done")))
+    with pytest.raises(KeyError, match="'env_index' tells environments apart and not their episodes: rows need"):
+        buffer.sample(4)
+
+
 def test_padded_rows_are_never_sampled():
     buffer = _buffer(2)
     batch = _rows([0, 0, 0, 1, 1, 0], t=torch.arange(6))
@@ -430,6 +438,21 @@ def test_a_sampler_keeps_no_storage_alive():
     ring.write(contiguous([5], 12))
     ring.draw(1)
     assert not any(isinstance(value, Storage) for value in vars(ring.sampler).values())
+
+
+def test_a_sampler_serves_one_buffer_and_its_copy_another():
+    sampler = StepSliceSampler(2)
+    first, second = (TensorDictReplayBuffer(storage=LazyTensorStorage(50), sampler=sampler) for _ in range(2))
+    first.extend(_rows([0, 0, 0, 1, 1]))
+    assert _drawn(first, 2) == {(0, 1), (1, 2), (3, 4)}
+    second.extend(_rows([0, 0, 1, 1, 1]))
+    with pytest.raises(RuntimeError, match="^this StepSliceSampler follows the rows of another buffer already"):
+        second.sample(4)
+    copied = copy.deepcopy(sampler)
+    copied.load_state_dict(StepSliceSampler(2).state_dict())
+    third = TensorDictReplayBuffer(storage=LazyTensorStorage(50), sampler=copied)
+    third.extend(_rows([0, 0, 1, 1, 1]))
+    assert _drawn(third, 2) == {(0, 1), (2, 3), (3, 4)}
 
 
 def test_draws_are_reproducible_by_torch_manual_seed():

@@ -38,7 +38,8 @@ def evaluate(
 ) -> Episodes:
     """Plays whole episodes, acting without exploration noise.
 
-    A batched environment runs its episodes side by side: one planning call per step serves all of them.
+    A batched environment runs its episodes side by side: one planning call per step serves all of them. Those that end
+    first go on meanwhile, which counts for nothing. A single one is reset once for every episode, as by ``rollout``.
 
     Args:
         env (EnvBase): batch size [] or [n]; reset at the start.
@@ -117,7 +118,11 @@ def _round(
             inputs = tensordict.select(*policy.in_keys, strict=False).to(policy_device)
             outputs = policy(inputs).select(*policy.out_keys, strict=False)
             tensordict = tensordict.update(outputs.to(env.device or "cpu"))
-        stepped, tensordict = env.step_and_maybe_reset(tensordict)
+        if env.batch_size:
+            stepped, tensordict = env.step_and_maybe_reset(tensordict)
+        else:  # the next episode begins with the next round's reset
+            stepped = env.step(tensordict)
+            tensordict = env.step_mdp(stepped)
         following = stepped.get("next")
         _require_finite(following, (reward, *observed), running, int(length.max()) + 1)
         total += torch.where(running, following.get(reward).reshape(num_envs).cpu(), 0)

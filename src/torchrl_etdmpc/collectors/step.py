@@ -18,7 +18,13 @@ from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.collectors.errors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.collectors.evaluate import fitting_primers
-from torchrl_etdmpc.envs.episode import load_simulator_state, simulator_state
+from torchrl_etdmpc.envs.episode import (
+    is_plain,
+    load_simulator_state,
+    load_transform_states,
+    simulator_state,
+    transform_states,
+)
 from torchrl_etdmpc.envs.worker import start_workers_anew
 from torchrl_etdmpc.keys import FALLBACK, NEXT, PLAN, PLAN_MEAN, TRAJECTORY
 from torchrl_etdmpc.runs.errors import first_line
@@ -342,16 +348,23 @@ class StepCollector(BaseCollector):
             )
             return None
 
+    def _transform_states(self) -> dict[str, Any] | None:
+        with contextlib.suppress(Exception):  # of a transform that cannot tell its own
+            states = transform_states(self.env)
+            return states if is_plain(states) else None
+
     def state_dict(self) -> OrderedDict:
         """Counters, the place in the running episodes, the simulator's included, and in the random phase its policy's.
 
         Not the policy's weights. Plain dictionaries, numbers and tensors, so that ``torch.load(weights_only=True)``
-        reads them.
+        reads them. What transforms remember is there as well where the simulator has no state.
         """
+        simulator = self._simulator_state()
         return OrderedDict(
             frames=self._frames,
             next_trajectory=self._next_trajectory,
-            simulator=self._simulator_state(),
+            simulator=simulator,
+            transforms=self._transform_states() if simulator is None else None,
             carrier=None if self._carrier is None else self._carrier.clone().to_dict(),
             pending=[[row.to_dict() for row in rows] for rows in self._pending],
             last_rows=self._last_rows and [torch.as_tensor(entry).reshape(-1).cpu() for entry in self._last_rows],
@@ -364,9 +377,10 @@ class StepCollector(BaseCollector):
 
         Where the environment cannot be brought back (:func:`~torchrl_etdmpc.envs.simulator_state`), the episodes that
         were running end at their last step, as truncated ones, fresh ones with fresh trajectory ids begin, and a
-        warning says so; :attr:`begins_fresh` is ``True`` then. The environment begins as it would anew: give it
-        another seed (:meth:`set_seed`) if it is not to repeat itself. Call this when the buffer and its sampler are
-        restored: the ends that faults have made are written into the rows again.
+        warning says so; :attr:`begins_fresh` is ``True`` then. What transforms remember, such as the statistics of
+        ``VecNormV2``, is restored nevertheless, if it is tensors and plain numbers. The environment begins as it would
+        anew: give it another seed (:meth:`set_seed`) if it is not to repeat itself. Call this when the buffer and its
+        sampler are restored: the ends that faults have made are written into the rows again.
         """
         self._frames = state_dict["frames"]
         self._next_trajectory = state_dict["next_trajectory"]
@@ -383,8 +397,9 @@ class StepCollector(BaseCollector):
         self._last_rows = None if last_rows is None else (last_rows[0], last_rows[1])
         self.begins_fresh = self._frames > 0
         if state_dict.get("simulator") is None:
+            lost = self._lost_of_transforms(state_dict.get("transforms"))
             if self._frames:
-                warnings.warn("the environment cannot be restored, so fresh episodes begin.", stacklevel=2)
+                warnings.warn(f"the environment cannot be restored, so fresh episodes begin{lost}.", stacklevel=2)
             self._truncate_episodes()
             return
         if not load_simulator_state(self.env, state_dict["simulator"]):
@@ -399,6 +414,14 @@ class StepCollector(BaseCollector):
         if state_dict["carrier"] is not None:  # else between episodes
             self._carrier = TensorDict(state_dict["carrier"], batch_size, device=device)
             self._after_reset = True  # if it is not, nothing is lost by looking twice
+
+    def _lost_of_transforms(self, states: dict[str, Any] | None) -> str:
+        """Restores what transforms remember, and says what could not be."""
+        try:
+            load_transform_states(self.env, states or {})
+        except (RuntimeError, LookupError):
+            return ", and its transforms begin anew: they are others than were saved"
+        return ", and its transforms begin anew: what they remember could not be saved" if states is None else ""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(num_envs={self.num_envs}, frames={self._frames}, insertion={self.insertion!r})"

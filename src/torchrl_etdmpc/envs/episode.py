@@ -224,7 +224,7 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
         for worker in range(len(flags)):
             flags[worker] = 0
     try:
-        _load_transform_states(env, state.get(_TRANSFORMS, {}))
+        load_transform_states(env, state.get(_TRANSFORMS, {}))
     except (RuntimeError, LookupError):  # made in another way than the one that was saved
         return False
     return equal_states(simulator_state(env), state)
@@ -243,14 +243,21 @@ def transform_states(env: EnvBase) -> dict[str, Any]:
     return states
 
 
-def _load_transform_states(env: EnvBase, states: dict[str, Any]) -> None:
+def load_transform_states(env: EnvBase, states: dict[str, Any]) -> None:
+    """Restores :func:`transform_states`.
+
+    Raises:
+        RuntimeError, LookupError: if the environment has other transforms.
+    """
     transforms = transforms_of(env)
     for place, state in states.items():
         transform = transforms[int(place)]
         for name, buffer in transform.named_buffers():
             if isinstance(buffer, UninitializedBuffer):
                 buffer.materialize(state[name].shape, device=env.device, dtype=state[name].dtype)
-        transform.load_state_dict(copy.deepcopy(state), strict=False)  # its weights stay
+        unknown = transform.load_state_dict(copy.deepcopy(state), strict=False).unexpected_keys  # its weights stay
+        if unknown:
+            raise LookupError(f"{type(transform).__name__} remembers no {', '.join(unknown)}.")
 
 
 def is_plain(state: Any) -> bool:

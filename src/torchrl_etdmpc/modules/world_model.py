@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.spectral_norm import SpectralNorm
 
 from torchrl_etdmpc.functional import clipped_sample, two_hot_decode
 from torchrl_etdmpc.modules.dynamics import DynamicsEnsemble
@@ -270,6 +271,8 @@ def _unlike_in_training(encoder: nn.Module) -> Iterator[tuple[str, nn.Module]]:
         random = isinstance(layer, nn.RReLU) or (isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0)
         random |= isinstance(layer, nn.MultiheadAttention | nn.RNNBase) and layer.dropout > 0
         moving = isinstance(layer, nn.modules.batchnorm._NormBase) and layer.track_running_stats
+        moving |= isinstance(layer, nn.utils.parametrizations._SpectralNorm)
+        moving |= any(isinstance(hook, SpectralNorm) for hook in layer._forward_pre_hooks.values())
         if random or moving:
             yield name, layer
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
 
@@ -64,6 +65,7 @@ class SharedNetworksLoss(LossModule):
     def __init__(self, world_model: WorldModel) -> None:
         super().__init__()
         vars(self)["world_model"] = world_model  # not a submodule: its parameters are here already
+        _warn_of_untrained(world_model, self._attributes.values())
         self._trained = {}
 
     def _share_networks(self, trained: Collection[str], followed: Collection[str]) -> None:
@@ -240,3 +242,13 @@ class SharedNetworksLoss(LossModule):
                     entry = target.get(key).data if trained else own.detach().clone()  # it moves before it is read
                     entries[key if isinstance(key, str) else ".".join(key)] = entry
         return found
+
+
+def _warn_of_untrained(world_model: WorldModel, trained: Collection[str]) -> None:
+    others = {name.partition(".")[0] for name, parameter in world_model.named_parameters() if parameter.requires_grad}
+    if others := sorted(others - set(trained)):
+        warnings.warn(
+            f"no loss trains or saves {', '.join(others)} of {type(world_model).__name__}; put it into one of its "
+            "networks, such as the encoder, or into a Term that is a module, or freeze it with requires_grad_(False).",
+            stacklevel=5,
+        )

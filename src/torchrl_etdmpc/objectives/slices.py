@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -101,11 +102,15 @@ class SliceReader:
         counts = self._counted_steps(tensordict, entries["action"].shape[:2])
         self._refuse_termination(tensordict, counts)
         self._refuse_gaps(tensordict, counts, entries["action"].shape[:2])
-        for name, entry in entries.items():
-            if counts is not None:
-                # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN.
-                entry = _where(counts, entry, torch.ones_like if name == "plan_scale" else torch.zeros_like)
-            entries[name] = entry.transpose(0, 1)
+        if counts is not None:
+            # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN. What
+            # networks of the user's own read may be refused by them where it is zero, so they get what counts.
+            harmless = {"plan_scale": torch.ones_like, **dict.fromkeys(_FEATURES[:-1], torch.zeros_like)}
+            repeated = _Repeated(counts)
+            entries = {name: _where(counts, entry, harmless.get(name, repeated)) for name, entry in entries.items()}
+        self._refuse_unknown_ends(tensordict, counts, entries["next_observation"], keys["next_observation"])
+        self._warn_of_range(entries["action"], keys["action"])
+        entries = {name: entry.transpose(0, 1) for name, entry in entries.items()}
         fields: dict[str, Any] = {name: entries.pop(name, None) for name in FIELDS}
         fields["observation"] = fields["observation"][0]
         for name in ("reward", "terminated"):
@@ -223,6 +228,57 @@ class SliceReader:
                 f"{self.done_key!r} is True before the last step of a slice, so that another episode follows in it; "
                 "sample slices of one episode each (StepSliceSampler), or mask what follows (loss_mask_key)."
             )
+
+    def _refuse_unknown_ends(
+        self, tensordict: TensorDictBase, counts: Tensor | None, following: Any, key: NestedKey
+    ) -> None:
+        """An episode's last observation is learned like all others, so it must be there."""
+        done = tensordict.get(self.done_key, None)
+        if torch.compiler.is_compiling() or done is None or done.device.type != "cpu":
+            return
+        shape = following.shape[:2]
+        if done.numel() != shape.numel():
+            return
+        ends = done.reshape(shape).bool()
+        ends = ends if counts is None else ends & counts
+        if ends.any() and not _all_finite(following, ends):
+            raise ValueError(
+                f"{key!r} is not finite where {self.done_key!r} is True: an environment with auto_reset=True has lost "
+                "the last observations of its episodes; collect without auto_reset, or mask these steps "
+                "(loss_mask_key)."
+            )
+
+    def _warn_of_range(self, action: Tensor, key: NestedKey) -> None:
+        if not torch.compiler.is_compiling() and action.device.type == "cpu" and action.abs().max() > 1.001:
+            warnings.warn(
+                f"{key!r} leaves [-1, 1], where planner and policy look for actions; scale the data as ActionScaling "
+                "scales an environment's actions.",
+                stacklevel=4,
+            )
+
+
+def _all_finite(entry: Any, rows: Tensor) -> bool:
+    """Whether an entry ``[B, T, ...]``, or each of a dictionary, is finite in some rows ``[B, T]``."""
+    if is_tensor_collection(entry):
+        return all(_all_finite(value, rows) for value in entry.contiguous().values(True, True))
+    return not entry.is_floating_point() or bool(entry[rows].isfinite().all())
+
+
+class _Repeated:
+    """For steps ``[B, T]`` that do not count: the first of their slice, of a slice without one that counts another's.
+
+    Zeros where nothing counts at all.
+    """
+
+    def __init__(self, counts: Tensor) -> None:
+        self.first = counts[:, :1]  # with a step that counts, the first one does
+        self.any, self.other = self.first.any(), self.first.squeeze(1).int().argmax(0, keepdim=True)
+
+    def __call__(self, entry: Tensor) -> Tensor:
+        own = entry[:, :1]
+        begins = self.first.view(*self.first.shape, *(1,) * (entry.ndim - 2))
+        found = torch.where(begins, own, own.index_select(0, self.other))
+        return torch.where(self.any, found, torch.zeros_like(found))
 
 
 def _where(counts: Tensor, entry: Any, harmless: Callable[[Tensor], Tensor]) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -69,8 +70,9 @@ class StepSliceSampler(Sampler):
             buffer are batches.
         TypeError: if the storage is not a flat tensor storage, the buffer's writer does not write round the ring, or,
             with ``partial``, the buffer does not add the mask to its samples.
-        KeyError: if the rows lack ``traj_key`` or, with ``partial``, ``done_key``.
-        RuntimeError: if there is no complete slice yet, or the sampler missed writes.
+        KeyError: if the rows lack ``traj_key``, or ``done_key`` where it is needed: with ``partial``, and where only
+            ``env_index`` tells rows apart.
+        RuntimeError: if there is no complete slice yet, the sampler missed writes, or it is that of another buffer.
 
     >>> from tensordict import TensorDict
     >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -116,7 +118,7 @@ class StepSliceSampler(Sampler):
         self._followed = 0  # rows that are in the table
         self._trajectories = Trajectories()
         self._starts: tuple[np.ndarray, np.ndarray] | None = None  # of the rows that were followed
-        self._checked: int | None = None  # id of the storage whose buffer can hold and pass on what this sampler needs
+        self._storage: weakref.ref[Storage] | None = None  # whose rows these are
 
     def add(self, index: int) -> None:
         """Is called by the replay buffer after one row was written."""
@@ -209,9 +211,15 @@ class StepSliceSampler(Sampler):
                 f"{type(storage).__name__}(ndim={storage.ndim}); use LazyTensorStorage(capacity) or "
                 "LazyMemmapStorage(capacity) and write flat rows."
             )
-        if self._checked != id(storage):
+        known = None if self._storage is None else self._storage()
+        if known is not storage:
+            if known is not None:
+                raise RuntimeError(
+                    "this StepSliceSampler follows the rows of another buffer already, and would cut these by the "
+                    "episodes of those; make a sampler for each buffer."
+                )
             self._check_buffer(storage)
-            self._checked = id(storage)
+            self._storage = weakref.ref(storage)
         self._check_written(storage)
         oldest = max(self._written - storage.max_size, 0)
         if self._starts is None or self._followed < self._written:
@@ -328,11 +336,19 @@ class StepSliceSampler(Sampler):
         if not missing:
             return self.traj_keys
         if self.traj_keys == [TRAJECTORY] and stored.get(ENV_INDEX, None) is not None:
+            if all(stored.get(key, None) is None for key in (self.done_key, self.init_key)):
+                raise KeyError(
+                    f"{ENV_INDEX!r} tells environments apart and not their episodes: rows need {self.done_key!r} or "
+                    f"{self.init_key!r} as well; store one, or pass done_key=..."
+                )
             return [ENV_INDEX]
         raise KeyError(
             f"StepSliceSampler needs the trajectory id {', '.join(map(repr, missing))} in every row; collect with "
             "StepCollector or a TorchRL collector (track_traj_ids=True), or pass traj_key=..."
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"_storage": None}  # a copy goes with a copy of the buffer
 
     def state_dict(self) -> dict[str, Any]:
         """The trajectories and the write count."""
