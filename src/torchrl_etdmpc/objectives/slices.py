@@ -105,7 +105,8 @@ class SliceReader:
         if counts is not None:
             # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN. What
             # networks of the user's own read may be refused by them where it is zero, so they get what counts.
-            harmless = {"plan_scale": torch.ones_like, **dict.fromkeys(_FEATURES[:-1], torch.zeros_like)}
+            harmless: dict[NestedKey, Any] = dict.fromkeys(_FEATURES, torch.zeros_like)
+            harmless["plan_scale"] = torch.ones_like
             repeated = _Repeated(counts)
             entries = {name: _where(counts, entry, harmless.get(name, repeated)) for name, entry in entries.items()}
         self._refuse_unknown_ends(tensordict, counts, entries["next_observation"], keys["next_observation"])

@@ -347,7 +347,7 @@ class StepSliceSampler(Sampler):
             "StepCollector or a TorchRL collector (track_traj_ids=True), or pass traj_key=..."
         )
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Any:
         return super().__getstate__() | {"_storage": None}  # a copy goes with a copy of the buffer
 
     def state_dict(self) -> dict[str, Any]:
