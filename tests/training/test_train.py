@@ -405,7 +405,7 @@ def test_a_run_that_went_on_after_too_many_failures_has_as_many_new_ones(tmp_pat
 
 def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path, tiny_config, make_run, read_table):
     run = make_run(tiny_config(), tmp_path)
-    step = run.evaluator.env.step_and_maybe_reset
+    step = run.evaluator.env.step
     calls = []
 
     def break_once(tensordict: TensorDictBase):
@@ -414,7 +414,7 @@ def test_an_evaluation_that_fails_does_not_end_the_training(tmp_path, tiny_confi
             raise RuntimeError("no more of it")
         return step(tensordict)
 
-    run.evaluator.env.step_and_maybe_reset = break_once
+    run.evaluator.env.step = break_once
     message = r"^the evaluation at 80 env steps failed \(no more of it\); training goes on\.$"
     with pytest.warns(UserWarning, match=message):
         run.run()
@@ -445,7 +445,7 @@ def test_an_evaluation_that_fails_before_anything_was_learned_is_an_error(tmp_pa
     def fail(tensordict: TensorDictBase):
         raise RuntimeError("wrong sizes")
 
-    run.evaluator.env.step_and_maybe_reset = fail
+    run.evaluator.env.step = fail
     with pytest.raises(RuntimeError, match="wrong sizes"):
         run.run()
 

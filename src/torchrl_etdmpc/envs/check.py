@@ -114,9 +114,9 @@ def env_sizes(env: EnvBase) -> dict[str, int]:
     Returns:
         dict: ``observation_dim`` and ``action_dim``.
 
-    >>> from torchrl_etdmpc.testing import LQRWorld
-    >>> env_sizes(LQRWorld())
-    {'observation_dim': 2, 'action_dim': 1}
+    >>> from torchrl_etdmpc.envs import make_env
+    >>> env_sizes(make_env("gym/Pendulum-v1"))
+    {'observation_dim': 3, 'action_dim': 1}
     """
     return {
         "observation_dim": env.observation_spec["observation"].shape[-1],

@@ -245,8 +245,10 @@ class SharedNetworksLoss(LossModule):
 
 
 def _warn_of_untrained(world_model: WorldModel, trained: Collection[str]) -> None:
-    others = {name.partition(".")[0] for name, parameter in world_model.named_parameters() if parameter.requires_grad}
-    if others := sorted(others - set(trained)):
+    networks = [network for name in trained if (network := getattr(world_model, name)) is not None]
+    known = {id(parameter) for network in networks for parameter in network.parameters()}
+    left = [name for name, p in world_model.named_parameters() if p.requires_grad and id(p) not in known]
+    if others := sorted({name.removeprefix("_orig_mod.").partition(".")[0] for name in left}):
         warnings.warn(
             f"no loss trains or saves {', '.join(others)} of {type(world_model).__name__}; put it into one of its "
             "networks, such as the encoder, or into a Term that is a module, or freeze it with requires_grad_(False).",
