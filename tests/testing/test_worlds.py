@@ -154,6 +154,16 @@ def test_the_value_of_the_regulator_is_the_return_of_its_own_control():
     assert total == pytest.approx(world.value(state).item(), rel=1e-4)
 
 
+def test_only_the_symmetric_part_of_a_cost_counts_for_the_optimum_as_it_does_for_the_rewards():
+    skewed = torch.tensor([[1.0, 0.6], [0.0, 1.0]])
+    for name, more in (("state_cost", {}), ("action_cost", {"control_matrix": torch.eye(2)})):
+        one, other = (LQRWorld(**{name: cost}, **more) for cost in (skewed, (skewed + skewed.mT) / 2))
+        torch.testing.assert_close(one.value_matrix, other.value_matrix)
+        torch.testing.assert_close(one.gain, other.gain)
+        state = torch.tensor([0.2, -0.1])
+        assert one.reward(state, state[: one.action_dim]) == other.reward(state, state[: one.action_dim])
+
+
 def test_a_regulator_that_cannot_hold_its_state_is_refused():
     with pytest.raises(ValueError, match=r"^the Riccati equation has no solution after 10,000 iterations"):
         LQRWorld(torch.full((1, 1), 1.2), torch.zeros(1, 1), discount=1.0)

@@ -571,6 +571,18 @@ def test_a_state_that_lacks_what_this_updater_needs_is_refused_before_anything_c
     assert not other.optimizer.state_dict()["state"]
 
 
+@pytest.mark.parametrize("name", ["exp_avg", "exp_avg_sq"])
+@pytest.mark.parametrize("change", [lambda x: x[:3], lambda x: x.clone().index_fill_(0, torch.tensor(2), torch.nan)])
+def test_a_state_whose_moments_do_not_fit_is_refused_before_anything_changes(name, change):
+    updater, other = make_updater(), make_updater()
+    updater.step(make_batch())
+    state = copy.deepcopy(updater.state_dict())
+    state["optimizer"]["state"][1][name] = change(state["optimizer"]["state"][1][name])
+    with pytest.raises(ValueError, match=rf"^the optimiser's {name} has another size than the weights, or is not"):
+        other.load_state_dict(state)
+    assert not other.optimizer.state_dict()["state"]
+
+
 def test_training_goes_on_bit_for_bit_from_a_saved_state():
     original, batches = make_updater(), [make_batch() for _ in range(5)]
     for seed, batch in enumerate(batches[:3]):

@@ -264,8 +264,8 @@ class LQRWorld(AnalyticWorld):
     ) -> None:
         a = _matrix(transition_matrix, [[1.0, 0.5], [0.0, 1.0]])
         b = _matrix(control_matrix, [[0.125], [0.5]])
-        q = _matrix(state_cost, torch.eye(a.shape[-1]))
-        r = _matrix(action_cost, torch.eye(b.shape[-1]))
+        q, r = _matrix(state_cost, torch.eye(a.shape[-1])), _matrix(action_cost, torch.eye(b.shape[-1]))
+        q, r = (q + q.mT) / 2, (r + r.mT) / 2  # the rewards are the same, and the equation is that of such costs
         super().__init__(*b.shape, **heads)
         self.discount = discount
         value, gain = _solve_riccati(a, b, q, r, discount)

@@ -193,7 +193,9 @@ def read_agent_file(path: str | Path) -> dict[str, Any]:
     for entry in ("task", "planner"):
         if entry not in content["config"]:
             raise CheckpointError(f"{path} is not a whole checkpoint: its config lacks {entry}.")
-    for name, value in (*content["world_model"].items(), *content["loss"].items()):
+    averaged = content["updater"].get("averaged")
+    acting = averaged if isinstance(averaged, dict) else {}  # anything else is refused where it is loaded
+    for name, value in (*content["world_model"].items(), *content["loss"].items(), *acting.items()):
         if not isinstance(value, torch.Tensor):
             raise CheckpointError(
                 f"{path} is not a checkpoint: {name} is no tensor but of type {type(value).__name__}."

@@ -293,7 +293,7 @@ class Updater:
 
         Raises:
             ValueError: if it is of an updater without a schedule or averages that this one has, or with a schedule that
-                it lacks.
+                it lacks, or if moments of the optimiser have another size or are not finite.
         """
         needed = {"schedule": ("lr_halved_after", self._schedule), "averaged": ("average_decay", self.average_decay)}
         for entry, (argument, own) in needed.items():
@@ -301,6 +301,11 @@ class Updater:
                 raise ValueError(f"the state is of an updater without {argument}; build this one without it, too.")
         if "schedule" in state_dict and self._schedule is None:  # the rates would stay where they have fallen to
             raise ValueError("the state is of an updater with lr_halved_after; build this one with it, too.")
+        trained = dict(enumerate(p for group in self.optimizer.param_groups for p in group["params"]))
+        for number, moments in state_dict["optimizer"]["state"].items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                if moments[name].shape != trained[number].shape or not moments[name].isfinite().all():
+                    raise ValueError(f"the optimiser's {name} has another size than the weights, or is not finite.")
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.skipped.copy_(state_dict["skipped"])
         self.skipped_in_a_row.copy_(state_dict["skipped_in_a_row"])
