@@ -107,6 +107,7 @@ def test_the_steps_of_a_compiled_world_model_count(make_loss, world_model, slice
 
 
 def test_a_compiled_step_counts(make_loss, world_model, slices, total):
+    gc.collect()  # models of other tests, which Dynamo would miss if they went while it compiles
     loss = make_loss("whole", world_model)
     optimizer = torch.optim.Adam(loss.parameters())
     total(loss(slices)).backward()
