@@ -106,15 +106,54 @@ def test_the_steps_of_a_compiled_world_model_count(make_loss, world_model, slice
     assert world_model.version == 3
 
 
-def test_a_compiled_step_counts(make_loss, world_model, slices, total):
-    gc.collect()  # models of other tests, which Dynamo would miss if they went while it compiles
-    loss = make_loss("whole", world_model)
+def test_a_compiled_step_counts_whatever_models_come_and_go(make_loss, make_world_model, slices, total):
+    compiled = []
+
+    def collecting(graph, inputs):
+        """A compiler while which the garbage collector runs."""
+        gc.collect()
+        compiled.append(graph)
+        return graph.forward
+
+    gone = make_loss("whole", make_world_model())
+    gone.itself = [gone]  # goes with the next collection, not with its name
+    loss = make_loss("whole", make_world_model())
+    world_model = loss.world_model
     optimizer = torch.optim.Adam(loss.parameters())
     total(loss(slices)).backward()
-    step = torch.compile(optimizer.step, backend="eager")
-    for _ in range(3):
+    step = torch.compile(optimizer.step, backend=collecting)
+    alive = weakref.ref(gone.world_model)
+    gc.disable()
+    try:
+        del gone
+        assert alive() is not None
         step()
-    assert world_model.version == 3
+    finally:
+        gc.enable()
+    assert alive() is None
+    step()
+    graphs = len(compiled)
+    later = make_loss("whole", make_world_model())
+    step()
+    assert (world_model.version, later.world_model.version) == (3, 0)
+    assert len(compiled) == graphs
+
+
+def test_world_models_that_share_a_network_each_count(make_loss, make_world_model, slices, total):
+    models = [make_world_model(), make_world_model()]
+    models[1].encoder = models[0].encoder
+    losses = [make_loss("whole", model) for model in models]
+    train(losses[0], torch.optim.Adam(losses[0].parameters()), slices=slices, total=total)
+    assert [int(model.version) for model in models] == [3, 3]
+
+
+def test_a_world_model_that_is_gone_takes_its_entries_along(make_loss, make_world_model):
+    before = set(update_count._counts)
+    loss = make_loss("whole", make_world_model())
+    assert set(update_count._counts) > before
+    del loss
+    gc.collect()
+    assert set(update_count._counts) <= before
 
 
 @pytest.mark.parametrize("updates", [1, 3])
@@ -202,7 +241,8 @@ def test_an_optimizer_beside_the_one_that_counts_does_not(make_loss, world_model
 def test_the_count_stays_in_its_memory_for_graphs_that_read_it(loss, world_model, slices, total):
     optimizer = torch.optim.SGD(loss.parameters())
     train(loss, optimizer, slices=slices, total=total, steps=1)
-    memory = update_count._counts[world_model].after
+    (count,) = update_count._counts_of(world_model.parameters())
+    memory = count.after
     train(loss, optimizer, slices=slices, total=total, steps=2)
-    assert update_count._counts[world_model].after is memory
+    assert count.after is memory
     assert memory == world_model.version == 3

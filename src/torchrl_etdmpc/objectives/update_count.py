@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable
 from typing import Any, cast
-from weakref import ReferenceType, WeakKeyDictionary, ref
+from weakref import ReferenceType, finalize, ref
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -17,6 +17,7 @@ from torchrl_etdmpc.modules import WorldModel
 
 @dataclasses.dataclass(eq=False)
 class _Count:
+    world_model: ReferenceType[nn.Module]
     trained: tuple[nn.Parameter, ...]
     """In the model's order."""
     after: Tensor
@@ -25,6 +26,12 @@ class _Count:
     """The optimiser whose steps are the updates: of those that have stepped and are still there, the one that holds the
     first parameter. It need not hold those that are frozen."""
 
+    @property
+    def version(self) -> Tensor | None:
+        """The world model's, which a cast replaces; ``None`` once nobody holds the model."""
+        world_model = self.world_model()
+        return None if world_model is None else _version(world_model)
+
     def place(self, optimizer: Optimizer | None) -> int:
         """Of the first trainable parameter that the optimiser holds; behind all of them if there is none."""
         groups = [] if optimizer is None else optimizer.param_groups
@@ -32,8 +39,17 @@ class _Count:
         places = (place for place, p in enumerate(self.trained) if p.requires_grad and id(p) in held)
         return next(places, len(self.trained))
 
+    def restart(self, version: Tensor) -> None:
+        """Takes this version as the one to go on from."""
+        if self.after.device == version.device:
+            self.after.copy_(version)  # in place: a captured CUDA graph goes on reading this memory
+        else:
+            self.after = version.clone()
 
-_counts: WeakKeyDictionary[nn.Module, _Count] = WeakKeyDictionary()
+
+_counts: dict[int, tuple[_Count, ...]] = {}
+"""By the id of a trained parameter, which lives as long as its entry. A compiled step looks up the parameters of its
+optimiser alone: models that come and go meanwhile are nothing to it."""
 
 
 def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> None:
@@ -52,24 +68,44 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
     """
     _listen()
     known = {id(parameter) for parameter in trained}
-    if world_model in _counts:
-        known |= {id(parameter) for parameter in _counts[world_model].trained}
-    ordered = tuple(parameter for parameter in world_model.parameters() if id(parameter) in known)
-    _counts[world_model] = _Count(ordered, world_model.version.clone())
+    count = _count_for(world_model)
+    if count is None:
+        count = _Count(ref(world_model), (), world_model.version.clone())
+        finalize(world_model, _forget, count).atexit = False
+    known |= {id(parameter) for parameter in count.trained}
+    _forget(count)
+    count.trained = tuple(parameter for parameter in world_model.parameters() if id(parameter) in known)
+    count.restart(world_model.version)
+    for parameter in count.trained:
+        _counts[id(parameter)] = (*_counts.get(id(parameter), ()), count)
 
 
 def restart_count(world_model: nn.Module) -> None:
     """Takes a version that was loaded, not counted, as the one to go on from."""
-    if world_model in _counts:
-        count, version = _counts[world_model], _version(world_model)
-        if count.after.device == version.device:
-            count.after.copy_(version)  # in place: a captured CUDA graph goes on reading this memory
-        else:
-            count.after = version.clone()
+    count = _count_for(world_model)
+    if count is not None:
+        count.restart(_version(world_model))
 
 
 def _version(world_model: nn.Module) -> Tensor:
     return cast(Tensor, world_model.version)  # get_buffer does not find it in one that torch.compile has wrapped
+
+
+def _count_for(world_model: nn.Module) -> _Count | None:
+    counts = _counts_of(world_model.parameters())
+    return next((count for count in counts if count.world_model() is world_model), None)
+
+
+def _counts_of(parameters: Iterable[Tensor]) -> list[_Count]:
+    found = [count for parameter in parameters for count in _counts.get(id(parameter), ())]
+    return list({id(count): count for count in found}.values())
+
+
+def _forget(count: _Count) -> None:
+    for parameter in count.trained:
+        others = tuple(other for other in _counts.pop(id(parameter), ()) if other is not count)
+        if others:
+            _counts[id(parameter)] = others
 
 
 @functools.cache
@@ -78,11 +114,12 @@ def _listen() -> None:
 
 
 def _count(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-    for world_model, count in list(_counts.items()):
+    for count in _counts_of(parameter for group in optimizer.param_groups for parameter in group["params"]):
         place = count.place(optimizer)
         counting = None if count.counts is None else count.counts()
         if place < len(count.trained) and (optimizer is counting or place <= count.place(counting)):
             count.counts = ref(optimizer)
-            version = _version(world_model)
-            version += version != count.after.to(version.device) + 1
-            restart_count(world_model)
+            version = count.version
+            if version is not None:
+                version += version != count.after.to(version.device) + 1
+                count.restart(version)
