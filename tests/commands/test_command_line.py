@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("hydra")
 
 from torchrl_etdmpc.commands.command_line import as_typed, hydra_main  # noqa: E402
+from torchrl_etdmpc.commands.evaluate import EvaluateConfig  # noqa: E402
 from torchrl_etdmpc.commands.train import CONFIG  # noqa: E402
 from torchrl_etdmpc.training import TrainConfig  # noqa: E402
 
@@ -27,6 +28,7 @@ def run_command(monkeypatch, capfd):
         except SystemExit as stop:
             assert capfd.readouterr() == ("", "")
             assert "\n" not in stop.code
+            assert received == []
             return stop.code
         return received[0] if received else capfd.readouterr().out
 
@@ -70,6 +72,17 @@ WRONG = [
         ("-m", "seed=1,2", "planner.horizon=3,4", "task.episode_length=choice(200,400)", "run_dir=runs/${seed}"),
         "run_dir=runs/${seed} would be that of several runs, which differ in planner.horizon, episode_length; put what "
         "differs into it, e.g. run_dir='runs/${seed}/${planner.horizon}/${episode_length}'.",
+    ),
+    (("walker-walk",), "a setting is written name=value, got 'walker-walk'; did you mean task=walker-walk?"),
+    (("horizn",), "unknown setting horizn; did you mean reanalyze.horizon? --help lists all."),
+    (
+        ("--multirun", "preset=cpu", "task=walker-walk,walker-wlk"),
+        "unknown task 'walker-wlk'; did you mean walker-walk, walker-run, walker-stand? task=list on the command "
+        "line lists all.",
+    ),
+    (
+        ("--multirun", "preset=cpu", "seed=1,-1"),
+        "seed must be in [0, 2**32 - 1], got -1.",
     ),
     (("--help", "planer"), "there is no group and no setting 'planer'; did you mean planner? --help lists all."),
 ]
@@ -126,6 +139,32 @@ def test_a_sweep_leaves_no_folder_but_those_of_its_runs(run_command, tmp_path, m
     assert list(tmp_path.iterdir()) == []
     assert run_command(*sweep, "hydra.sweep.dir=kept").planner.horizon == 3
     assert (tmp_path / "kept" / "multirun.yaml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("output", "remedy"),
+    [
+        ("csv=a.csv", "csv='${seed}/a.csv'"),
+        ("video=films/a.mp4", "video='films/${seed}/a.mp4'"),
+        ("video=~/a.gif", "video='/home/me/${seed}/a.gif'"),
+    ],
+)
+def test_no_two_runs_of_a_sweep_write_the_same_file(run_command, monkeypatch, output, remedy):
+    monkeypatch.setenv("HOME", "/home/me")
+    message = run_command(
+        "--multirun", "checkpoint=a.pt", "seed=1,2", "planner.horizon=3", output, config_class=EvaluateConfig
+    )
+    assert message == (
+        f"error: {output.replace('~', '/home/me')} would be that of several runs, which differ in seed; put what "
+        f"differs into it, e.g. {remedy}."
+    )
+
+
+def test_a_checkpoint_that_stands_alone_is_recognised(run_command):
+    message = run_command("runs/a/best.pt", config_class=EvaluateConfig)
+    assert message == (
+        "error: a setting is written name=value, got 'runs/a/best.pt'; did you mean checkpoint=runs/a/best.pt?"
+    )
 
 
 def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):

@@ -39,7 +39,7 @@ def run_main(run_here) -> Callable[..., tuple[str | None, str, str]]:
 def closing_line(returns: torch.Tensor, policy: str) -> str:
     return (
         f"cartpole-balance ({policy}, trained for 400 env steps): return {returns.mean():.1f} "
-        f"+- {returns.std(correction=0):.1f} over {len(returns)} episodes"
+        f"+- {returns.std(correction=0):.1f} over {len(returns)} episode{'s' if len(returns) > 1 else ''}"
     )
 
 
@@ -80,6 +80,35 @@ def test_every_episode_has_its_line_in_a_table(tmp_path, monkeypatch, checkpoint
     assert table["episode"].tolist() == [0, 1, 2]
     assert table["return"].tolist() == played.returns.tolist()
     assert table["decisions"].tolist() == [500, 500, 500]
+
+
+def test_a_table_is_written_anew_and_another_file_stays(tmp_path, checkpoint, run_main):
+    arguments = (f"checkpoint={checkpoint}", "episodes=1", "policy=bare", "device=cpu", "task.episode_length=20")
+    (tmp_path / "a.csv").write_text("episode,return,decisions\n0,1.0,1\n1,1.0,1\n")
+    message, out, _ = run_main(*arguments, "csv=a.csv")
+    assert message is None
+    assert out.startswith("cartpole-balance with episode_length=20 (bare, trained for 400 env steps): return ")
+    assert out.endswith(" over 1 episode; episodes in a.csv\n")
+    assert len((tmp_path / "a.csv").read_text().splitlines()) == 2
+    for content in ("", "env_steps,return_mean\n0,1.0\n", "\0ü"):
+        (tmp_path / "eval.csv").write_text(content)
+        message, out, _ = run_main(*arguments, "csv=eval.csv")
+        assert message == "error: csv=eval.csv is there, and is no table of evaluated episodes; choose another file."
+        assert out == ""
+        assert (tmp_path / "eval.csv").read_text() == content
+
+
+def test_a_sweep_over_seeds_writes_a_table_for_each(tmp_path, checkpoint, run_main):
+    message, out, _ = run_main(
+        "--multirun", f"checkpoint={checkpoint}", "episodes=1", "policy=bare", "device=cpu", "seed=1,2",
+        "task.episode_length=20", "csv=tables/${seed}.csv",
+    )  # fmt: skip
+    assert message is None
+    assert [line.rpartition(" ")[2] for line in out.splitlines() if "episodes in" in line] == [
+        "tables/1.csv",
+        "tables/2.csv",
+    ]
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["1.csv", "2.csv"]
 
 
 def test_the_table_says_which_episodes_are_a_success(tmp_path, monkeypatch, checkpoint, run_main):
@@ -162,7 +191,8 @@ def test_the_command_may_change_the_planner(checkpoint, run_main):
     message, out, err = run_main(*common, "planner.horizon=4", "planner.num_samples=20")
     assert (message, err) == (None, "")
     assert out.startswith(
-        "cartpole-balance (planner with horizon=4, num_samples=20, trained for 400 env steps): return "
+        "cartpole-balance with episode_length=40 (planner with horizon=4, num_samples=20, trained for 400 env "
+        "steps): return "
     )
     agent, _, _ = load_agent(checkpoint)
     planner = with_settings(agent.eval_planner, horizon=4, num_samples=20)

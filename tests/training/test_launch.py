@@ -19,6 +19,7 @@ from torchrl_etdmpc.collectors import StepCollector
 from torchrl_etdmpc.envs import Task, register_task
 from torchrl_etdmpc.runs import RunDirectory, RunLog
 from torchrl_etdmpc.training import (
+    Evaluator,
     RunInterrupted,
     TrainConfig,
     TrainingRun,
@@ -447,19 +448,23 @@ def test_a_run_that_was_killed_before_its_first_interval_ends_the_same(
 
 
 @needs_dm_control
-@pytest.mark.parametrize("place", ["make_env", "precompile", "_train"])
+@pytest.mark.parametrize("place", ["make_env", "precompile", "_train", "evaluate"])
 def test_a_signal_before_the_first_step_leaves_nothing_behind(command, tmp_path, monkeypatch, process, place):
-    owner = TrainingRun if place == "precompile" else importlib.import_module("torchrl_etdmpc.training.launch")
-    original = getattr(owner, place)
+    owners = {"precompile": TrainingRun, "evaluate": Evaluator}
+    owner = owners.get(place, importlib.import_module("torchrl_etdmpc.training.launch"))
+    name = "__call__" if place == "evaluate" else place
+    original, went_on = getattr(owner, name), []
 
     def interrupted(*args: Any, **kwargs: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
+        went_on.append(place)
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(owner, place, interrupted)
+    monkeypatch.setattr(owner, name, interrupted)
     with pytest.raises(RunInterrupted, match=r"^stopped before the first step, with nothing to save; start it ag"):
         launch(command())
     assert list(tmp_path.iterdir()) == []
+    assert not went_on
 
 
 @needs_dm_control

@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_etdmpc.envs import Task, get_task
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.training import Agent, TrainConfig, build_planner, config_of, read_agent_file
+from torchrl_etdmpc.training import TASK_SETTINGS, Agent, TrainConfig, build_planner, config_of, read_agent_file
 from torchrl_etdmpc.training.config import PlannerConfig
 
 
@@ -38,13 +38,16 @@ class AgentCommandConfig:
     @property
     def task_spec(self) -> Task:
         """The task that is named, or the one that the agent was trained on, with what its run changed about it."""
-        changes = {name: getattr(self, name) for name in ("action_repeat", "episode_length", "terminates")}
-        told = {name: value for name, value in changes.items() if value is not None}
         stored = trained_with(self.checkpoint)
         if self.task is not None and self.task != stored.task:
-            changed = {name: getattr(stored, name) for name in changes if getattr(stored, name) is not None}
-            return get_task(self.task, **(changed | told))
-        return dataclasses.replace(stored.task_spec, **told)
+            return get_task(self.task, **(_task_settings(stored) | _task_settings(self)))
+        return dataclasses.replace(stored.task_spec, **_task_settings(self))
+
+    @property
+    def changed_task(self) -> dict[str, Any]:
+        """The settings of the task that are not those of the agent's training."""
+        stored = trained_with(self.checkpoint).task_spec
+        return {name: value for name, value in _task_settings(self).items() if getattr(stored, name) != value}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,12 @@ class PlannerCommandConfig(AgentCommandConfig):
         stored = trained_with(self.checkpoint).planner
         now = dataclasses.asdict(self.planner)
         return {name: value for name, value in now.items() if getattr(stored, name) != value}
+
+
+def _task_settings(config: AgentCommandConfig | TrainConfig) -> dict[str, Any]:
+    """Those that are not the task's own."""
+    told = {name: getattr(config, name) for name in TASK_SETTINGS}
+    return {name: value for name, value in told.items() if value is not None}
 
 
 def trained_with(checkpoint: str) -> TrainConfig:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import itertools
 import os
 import re
 import sys
@@ -106,17 +107,24 @@ def hydra_main(
             for name, values in PRESETS.items():
                 ConfigStore.instance().store(group="preset", name=name, node=values.to_dict(), package="_global_")
 
-            @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
-            @one_line_errors  # inside as well: Hydra would add a line of its own to an exception that passes through it
-            def run(values) -> None:
+            def read(values) -> Any:
                 try:
                     plain: Any = OmegaConf.to_container(values, resolve=True, throw_on_missing=True)
                 except OmegaConfBaseException as error:  # ${...} in a value
                     raise ValueError(f"{error.full_key} cannot be read: {first_line(error)}") from error
-                with console():
-                    completed = plain if complete is None else complete(plain, explicit_settings())
-                    main(config_from_dict(config_class, completed))
+                completed = plain if complete is None else complete(plain, explicit_settings())
+                return config_from_dict(config_class, completed)
 
+            @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
+            @one_line_errors  # inside as well: Hydra would add a line of its own to an exception that passes through it
+            def run(values) -> None:
+                with console():
+                    main(read(values))
+
+            if _SWEEP_FLAGS & set(sys.argv):  # the last run's mistake is found before the first one begins
+                with hydra.initialize_config_dir(config_path, version_base="1.3"):
+                    for overrides in _runs_of_a_sweep(sys.argv[1:]):
+                        _ = read(hydra.compose(config_name, overrides)).task_spec
             with _without_traces_of_a_sweep():
                 run()
 
@@ -158,6 +166,9 @@ _ELSEWHERE = {"workers": "distributed", "engine": "distributed", "address": "dis
 _FLAGS = {"--cfg", "-c", "--resolve", "--multirun", "-m"}
 _SWEEP_FLAGS = {"--multirun", "-m"}
 _PATHS = {"run_dir", "checkpoint", "out", "video", "save"}
+_FILES = ("video", "csv")
+_OUTPUTS = ("run_dir", "out", "save", *_FILES)
+_ALL = "--help lists all."
 
 
 def _checked(arguments: list[str], config_class: type) -> list[str]:
@@ -194,6 +205,9 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
             )
         if name not in settings:
             hint = f"the command {_ELSEWHERE[name]} has it." if name in _ELSEWHERE else nearest(name, settings)
+            main = next((main for main in ("checkpoint", "task") if main in settings), None)
+            if main is not None and hint == _ALL and not equals:
+                raise ValueError(f"a setting is written name=value, got {argument!r}; did you mean {main}={argument}?")
             raise ValueError(f"unknown setting {name}; {hint}")
         if argument.startswith("-") or not equals:
             raise ValueError(f"a setting is written name=value, without dashes or spaces, got {argument!r}.")
@@ -202,7 +216,7 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
                 preset(preset_name)
         if name in _PATHS and value.startswith("~"):
             value = os.path.expanduser(value)
-        if name == "run_dir":  # a setting of the task is named as it is typed; for Hydra the task is a text
+        if name in _OUTPUTS:  # a setting of the task is named as it is typed; for Hydra the task is a text
             value = re.sub(r"\$\{task\.(\w+)\}", r"${\1}", value)
         short = name.removeprefix("task.")
         checked.append(f"{short}={value if sweep else _readable(settings[name], value)}")
@@ -210,28 +224,50 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
     for name, setting in settings.items():
         if setting.default is dataclasses.MISSING and name not in given and not {"--cfg", "-c"} & set(flags):
             raise ValueError(f"{name}=... is missing: {setting.meaning[0].lower()}{setting.meaning[1:]}")
-    if sweep and "run_dir" in settings:
-        _require_directories(checked)
+    if sweep:
+        for name in (name for name in _OUTPUTS if name in settings):
+            _require_one_each(name, settings[name].default, checked)
     return flags + checked  # Hydra takes no flag between settings
 
 
-def _require_directories(arguments: list[str]) -> None:
-    """Each run of a sweep has a directory of its own: without ``run_dir`` it is named by task, preset and seed."""
+def _overrides(arguments: list[str]) -> list[Any]:
+    """The arguments as Hydra reads them."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    overrides = OverridesParser.create().parse_overrides(arguments)
-    swept = [it.key_or_group for it in overrides if it.is_sweep_override()]
-    swept = [name for name in swept if name != "run_dir" and not name.startswith("hydra.")]
-    run_dir = dict(argument.split("=", 1) for argument in arguments).get("run_dir", "null")
-    default = run_dir == "null"
-    named = ["task", "preset", "seed"] if default else re.findall(r"\$\{([\w.]+)\}", run_dir)
+    return OverridesParser.create().parse_overrides([argument for argument in arguments if argument not in _FLAGS])
+
+
+def _runs_of_a_sweep(arguments: list[str]) -> Iterator[list[str]]:
+    """What each run of a sweep is told, in the words of a single run."""
+    ways = []
+    for override in _overrides(arguments):
+        name = override.get_key_element()
+        if not name.startswith("hydra."):
+            swept = override.is_sweep_override()
+            values = override.sweep_string_iterator() if swept else [override.get_value_element_as_str()]
+            ways.append([f"{name}={value}" for value in values])
+    return map(list, itertools.product(*ways))
+
+
+def _require_one_each(output: str, default: str | None, arguments: list[str]) -> None:
+    """What a run writes is its own; without ``run_dir`` its directory is named by task, preset and seed."""
+    swept = [it.key_or_group for it in _overrides(arguments) if it.is_sweep_override()]
+    swept = [name for name in swept if name != output and not name.startswith("hydra.")]
+    path = dict(argument.split("=", 1) for argument in arguments).get(output, default or "null")
+    if path != "null":
+        what, named = f"{output}={path}", re.findall(r"\$\{([\w.]+)\}", path)
+        folder, file = os.path.split(path) if output in _FILES else (path, "")
+    elif output == "run_dir":
+        what, named, folder, file = "the default run_dir", ["task", "preset", "seed"], "runs", ""
+    else:
+        return
     shared = [name for name in swept if name not in named]
     if shared:
-        parts = ["runs", *swept] if default else [run_dir, *shared]
-        remedy = "/".join([parts[0], *(f"${{{name}}}" for name in parts[1:])])
+        missing = swept if path == "null" else shared
+        remedy = os.path.join(folder, *(f"${{{name}}}" for name in missing), file).rstrip("/")
         raise ValueError(
-            f"{'the default run_dir' if default else f'run_dir={run_dir}'} would be that of several runs, which differ "
-            f"in {', '.join(shared)}; put what differs into it, e.g. run_dir='{remedy}'."
+            f"{what} would be that of several runs, which differ in {', '.join(shared)}; put what differs into it, "
+            f"e.g. {output}='{remedy}'."
         )
 
 
@@ -278,7 +314,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(name.lower(), known, n=2, cutoff=0.85)
     near += [other for part in difflib.get_close_matches(last, parts, n=2, cutoff=0.75) for other in [parts[part]]]
     found = list(dict.fromkeys([*same, *near]))[:3]
-    return f"did you mean {' or '.join(found)}? --help lists all." if found else "--help lists all."
+    return f"did you mean {' or '.join(found)}? {_ALL}" if found else _ALL
 
 
 def explicit_settings() -> list[str]:

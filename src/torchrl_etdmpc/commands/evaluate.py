@@ -25,6 +25,7 @@ from torchrl_etdmpc.training import load_agent, resolve_device
 from torchrl_etdmpc.training.config import MOST_EPISODES
 
 GIF_SIZE = 200  # pixels, for a page
+_COLUMNS = "episode,return,decisions"
 FRAMES_PER_SECOND = 50  # of a film: one frame a decision, which is one to four times real time for DMC's tasks
 
 
@@ -66,6 +67,7 @@ def main(config: EvaluateConfig) -> None:
         if file is not None:
             path = Path(file).expanduser()
             make_folder_of(path)
+    _refuse_another_table(config.csv)
     device = resolve_device(config.device)
     task = config.task_spec
     env = make_env(task, seed=config.seed, num_envs=config.episodes, parallel=False)  # side by side
@@ -111,6 +113,16 @@ def main(config: EvaluateConfig) -> None:
         print(told)
 
 
+def _refuse_another_table(file: str | None) -> None:
+    """A table of evaluated episodes is written anew; what else is there, e.g. a run's learning curve, stays."""
+    path = None if file is None else Path(file).expanduser()
+    if path is None or not path.exists():
+        return
+    with path.open(errors="replace") as lines:
+        if not next(lines, "").startswith(_COLUMNS):
+            raise ValueError(f"csv={file} is there, and is no table of evaluated episodes; choose another file.")
+
+
 def _first(env: EnvBase) -> EnvBase:
     """The first of environments that run side by side, or the only one."""
     simulator = simulator_of(env)
@@ -120,7 +132,7 @@ def _first(env: EnvBase) -> EnvBase:
 def _table(task: Task, played: Episodes) -> str:
     """One line per episode, in the order of the initial states."""
     least = success_return(task)
-    rows = ["episode,return,decisions" + (",success" if least is not None else "")]
+    rows = [_COLUMNS + (",success" if least is not None else "")]
     for episode, (value, length) in enumerate(zip(played.returns.tolist(), played.lengths.tolist(), strict=True)):
         rows.append(f"{episode},{value},{length}" + (f",{int(value >= least)}" if least is not None else ""))
     return "\n".join([*rows, ""])
@@ -128,11 +140,13 @@ def _table(task: Task, played: Episodes) -> str:
 
 def _outcome(config: EvaluateConfig, task: Task, played: Episodes, trained: str) -> str:
     returns, least = played.returns, success_return(task)
-    settings = ", ".join(f"{name}={value}" for name, value in config.changed.items())
-    who = f"{config.policy} with {settings}" if settings else config.policy
+    what, who = (
+        f"{name} with {', '.join(f'{setting}={value}' for setting, value in changed.items())}" if changed else name
+        for name, changed in ((task.name, config.changed_task), (config.policy, config.changed))
+    )
     said = (
-        f"{task.name} ({who}, trained {trained} env steps): return {returns.mean():.1f} "
-        f"+- {returns.std(correction=0):.1f} over {len(returns)} episodes"
+        f"{what} ({who}, trained {trained} env steps): return {returns.mean():.1f} "
+        f"+- {returns.std(correction=0):.1f} over {len(returns)} episode{'s' * (len(returns) != 1)}"
     )
     if task.terminates:
         said += f" of {played.lengths.float().mean():.0f} decisions in the mean"

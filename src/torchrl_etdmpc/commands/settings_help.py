@@ -125,11 +125,12 @@ def help_text(
         for name, meaning in groups.items():
             lines += _wrap(f"{name + '.*':14}{meaning}", width, initial_indent="  ", subsequent_indent=" " * 16)
     lines += ["", "also:"]
+    swept = "seed=1,2" if "checkpoint" in settings else "task=a,b"
     for name, meaning in {
         **({"task=list": "prints all tasks by suite"} if "task" in settings else {}),
         **({"--help preset=cpu": "shows the defaults of that preset"} if "preset" in settings else {}),
-        "--cfg job": "prints every setting with its value, and does nothing else",
-        **({"--multirun task=a,b": "one run after the other for every combination"} if groups else {}),
+        "--cfg job": "prints every setting with its value, unchecked, and does nothing else",
+        **({f"--multirun {swept}": "one run after the other for every combination"} if groups else {}),
     }.items():
         lines += _wrap(f"{name:22}{meaning}", width, initial_indent="  ", subsequent_indent=" " * 24)
     return "\n".join(lines)

@@ -122,8 +122,9 @@ class TrainingRun:
         """
         try:
             self.precompile()
-            self.stop.nothing_to_save = False
+            self.stop.nothing_to_save = not self.env_steps
             self._do_what_is_due()
+            self.stop.nothing_to_save = False
             self._explore()
             self._pretrain()
             self._learn()
