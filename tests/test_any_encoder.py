@@ -178,6 +178,16 @@ def test_a_rollout_carries_plans_and_resets(kind):
     assert planner.env.rollout(3).shape == (3,)  # imagined, from a latent of zeros
 
 
+def test_steps_that_do_not_follow_each_other_are_a_warning(kind):
+    model = make_model(kind)
+    batch, loss = filled(kind, model).sample().reshape(-1, 3), make_loss(model)
+    batch = batch[~batch["next", "done"].flatten(1).any(1)]
+    loss(batch)
+    others = batch[torch.arange(len(batch)).roll(1)]
+    with pytest.warns(UserWarning, match="the slices join rows of several episodes"):
+        loss(torch.stack([batch[:, 0], others[:, 1], others[:, 2]], dim=1))
+
+
 def test_masked_steps_count_for_nothing_whatever_they_show(kind):
     model = make_model(kind)
     batch = filled(kind, model).sample().reshape(-1, 3)

@@ -340,6 +340,20 @@ def test_actions_beyond_what_planner_and_policy_know_are_a_warning(make_loss, sl
         loss(slices)
 
 
+def test_rows_that_do_not_follow_each_other_are_a_warning(make_loss, slices):
+    loss = make_loss("whole")
+    slices["observation"][1, 1] += 1
+    with pytest.warns(
+        UserWarning,
+        match=r"^\('next', 'observation'\) of a step is not 'observation' of the next: the slices join rows",
+    ):
+        loss(slices)
+    slices["collector", "mask"] = torch.ones(slices.shape, dtype=torch.bool)
+    slices["collector", "mask"][1, 1:] = False
+    loss(slices)
+    loss(slices[2:, :1])
+
+
 def test_a_network_of_a_world_model_that_no_loss_trains_is_a_warning():
     class Larger(WorldModel):
         def __init__(self, *sizes, **options):

@@ -174,7 +174,8 @@ def test_a_target_encoder_standardises_as_the_encoder_does(make_world_model, mak
     loss = EfficientTDMPCLoss(model, discount=0.9, extra_terms=[term], ignore_termination=True)
     update = SoftUpdate(loss, tau=0.5)
     batch = make_slices()
-    batch["observation"] = batch["observation"] + 50
+    for tensordict in (batch, batch["next"]):
+        tensordict["observation"] = tensordict["observation"] + 50
     for _ in range(3):
         loss(batch)
         update.step()

@@ -118,6 +118,7 @@ def test_the_policy_is_read_at_the_latents_before_each_step(make_loss, slices):
     loss = make_loss("policy", reduction="none").eval()
     before = loss(slices)["loss_policy"]
     slices["next", "observation"] = torch.randn_like(slices["next", "observation"])
+    slices["observation"][:, 1:] = slices["next", "observation"][:, :-1]
     last = slices["action"].clone()
     last[:, -1] *= -1
     slices["action"] = last

@@ -161,7 +161,7 @@ def test_the_targets_stand_on_the_encodings_of_the_steps_own_observations(make_l
     assert run_seeded(loss, slices)["value_target"] == before
     earlier = last.clone()
     earlier[:, 0] += 1
-    slices["next", "observation"] = earlier
+    slices["next", "observation"], slices["observation"][:, 1] = earlier, earlier[:, 0]
     assert run_seeded(loss, slices)["value_target"] != before
 
 

@@ -8,6 +8,7 @@ import math
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -279,6 +280,22 @@ def test_rows_that_are_not_finite_are_not_stored(started):
     learner.collector.shutdown()
 
 
+def test_rows_that_do_not_continue_those_before_are_not_stored(started):
+    workers, learner = started(), learner_of(config_of(workers=1))
+    learner.step()
+    every = iter(workers[0])
+    next(every)  # is lost
+    learner.collector._batches = every
+    learner.collector.act()
+    with pytest.raises(SimulatorError, match=r"^worker 0 sent rows that do not continue those before, after 8 decisi"):
+        learner.collector.finish_step()
+    assert len(learner.replay) == 8 and workers[0].closed
+    for _ in range(4):
+        learner.step()  # others
+    assert len(learner.replay) == 40
+    learner.collector.shutdown()
+
+
 def test_what_goes_on_from_a_checkpoint_numbers_its_workers_on(started):
     started()
     first = learner_of(config_of())
@@ -386,10 +403,24 @@ def processes_of(owner: int) -> set[int]:
     return found
 
 
-def test_two_processes_collect_and_none_is_left(tmp_path, monkeypatch):
+def test_two_processes_collect_every_row_for_a_slow_learner_and_none_is_left(tmp_path, monkeypatch):
     before = processes_of(os.getpid())
     monkeypatch.setenv("MUJOCO_GL", "disable")
+    finish_step, batches = distributed.WorkerCollector.finish_step, []
+
+    def slowly(collector: distributed.WorkerCollector, acted: None) -> TensorDictBase:
+        batches.append(finish_step(collector, acted).clone())
+        if len(batches) in (8, 9, 10):
+            time.sleep(2.5)  # TorchRL's workers wait for a second
+        return batches[-1]
+
+    monkeypatch.setattr(distributed.WorkerCollector, "finish_step", slowly)
     line = launch(config_of(run_dir=str(tmp_path / "run")))
+    for worker in (0, 1):
+        rows = torch.cat([batch for batch in batches if batch["worker"][0] == worker])
+        goes_on = ~rows["next", "done"][:-1, 0]
+        assert goes_on.any()
+        assert torch.equal(rows["observation"][1:][goes_on], rows["next", "observation"][:-1][goes_on])
     assert "after 200 env steps" in line
     directory = RunDirectory(tmp_path / "run")
     with directory.train.open() as file:
@@ -407,6 +438,22 @@ def test_a_worker_process_that_is_killed_is_replaced(tmp_path):
     explore_and_pretrain(learner)
     os.kill(min(processes_of(os.getpid()) - before), signal.SIGKILL)
     with pytest.warns(UserWarning, match=r"worker \d ended \(exit code -9\); all workers are started anew"):
+        while learner.step(updates=True):
+            pass
+    assert all(learner.step(updates=True) for _ in range(4))
+    learner.collector.shutdown()
+    assert processes_of(os.getpid()) <= before
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_worker_process_that_hangs_is_replaced(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.training.workers._PATIENCE_S", 3)
+    learner = learner_of(config_of(total_env_steps=2000))
+    before = processes_of(os.getpid())
+    explore_and_pretrain(learner)
+    os.kill(min(processes_of(os.getpid()) - before), signal.SIGSTOP)
+    with pytest.warns(UserWarning, match=r"a worker failed: it has not answered for 3 seconds; all workers are starte"):
         while learner.step(updates=True):
             pass
     assert all(learner.step(updates=True) for _ in range(4))

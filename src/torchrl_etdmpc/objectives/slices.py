@@ -111,6 +111,7 @@ class SliceReader:
             entries = {name: _where(counts, entry, harmless.get(name, repeated)) for name, entry in entries.items()}
         self._refuse_unknown_ends(tensordict, counts, entries["next_observation"], keys["next_observation"])
         self._warn_of_range(entries["action"], keys["action"])
+        self._warn_of_holes(entries, counts, keys)
         entries = {name: entry.transpose(0, 1) for name, entry in entries.items()}
         fields: dict[str, Any] = {name: entries.pop(name, None) for name in FIELDS}
         fields["observation"] = fields["observation"][0]
@@ -257,12 +258,37 @@ class SliceReader:
                 stacklevel=4,
             )
 
+    def _warn_of_holes(
+        self, entries: Mapping[NestedKey, Any], counts: Tensor | None, keys: Mapping[NestedKey, NestedKey]
+    ) -> None:
+        """What a step leads to is what the next one begins with, unless rows of other episodes or moments follow."""
+        action = entries["action"]
+        if torch.compiler.is_compiling() or action.device.type != "cpu" or action.shape[1] == 1:
+            return
+        apart = _differ(entries["observation"][:, 1:], entries["next_observation"][:, :-1])
+        if (apart if counts is None else apart & counts[:, 1:]).any():
+            warnings.warn(
+                f"{keys['next_observation']!r} of a step is not {keys['observation']!r} of the next: the slices join "
+                "rows of several episodes (sample with StepSliceSampler and unique ids), or rows are missing between "
+                "them. Where an augmentation makes the two differ, ignore this.",
+                stacklevel=4,
+            )
+
 
 def _all_finite(entry: Any, rows: Tensor) -> bool:
     """Whether an entry ``[B, T, ...]``, or each of a dictionary, is finite in some rows ``[B, T]``."""
     if is_tensor_collection(entry):
         return all(_all_finite(value, rows) for value in entry.contiguous().values(True, True))
     return not entry.is_floating_point() or bool(entry[rows].isfinite().all())
+
+
+def _differ(entry: Any, other: Any) -> Tensor:
+    """Where two entries ``[B, T, ...]``, or any of two dictionaries, are not the same, bool ``[B, T]``."""
+    if is_tensor_collection(entry):
+        keys = entry.keys(True, True)
+        return torch.stack([_differ(entry.get(key), other.get(key)) for key in keys]).any(0)
+    differ = (entry != other) & (entry == entry)  # what is not a number is another fault
+    return differ.reshape(*entry.shape[:2], -1).any(-1)
 
 
 class _Repeated:

@@ -16,7 +16,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
-from torchrl_etdmpc.keys import NEXT, PLAN, VALUE, VERSION, WORKER
+from torchrl_etdmpc.keys import NEXT, OBSERVATION, PLAN, VALUE, VERSION, WORKER
 from torchrl_etdmpc.runs import first_line
 from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.compilation import resolve_compile
@@ -93,8 +93,8 @@ def is_distributed(settings: Any) -> bool:
 class WorkerCollector:
     """Stands where :class:`~torchrl_etdmpc.collectors.StepCollector` does in a run; a step is a batch of one worker.
 
-    The workers plan and step in processes of their own (``start_workers``) and go on while the learner updates, at
-    most two batches ahead of it. What is lost against one process:
+    The workers plan and step in processes of their own (``start_workers``) and go on while the learner updates, each at
+    most a batch ahead of it. What is lost against one process:
 
     - freshness of each step: a decision is made with weights that are some updates old (``weight_age`` in
       ``train.csv``), and a row is stored when its batch arrives. Weights that arrive while a plan is made may mix with
@@ -143,6 +143,7 @@ class WorkerCollector:
         self._arrived = False
         self._sent: dict[int, int] = {}  # by worker, the updates that its weights had
         self._last_worker: int | None = None
+        self._ends: dict[int, TensorDictBase] = {}  # by worker, the last row that came from it
 
     @property
     def frames(self) -> int:
@@ -174,7 +175,8 @@ class WorkerCollector:
             TensorDictBase: the rows, batch size [n]; what is not stored is in them too.
 
         Raises:
-            SimulatorError: if a worker failed; the next call of :meth:`act` starts all of them anew.
+            SimulatorError: if a worker failed, or its rows do not continue those before; the next call of :meth:`act`
+                starts all of them anew.
             NonFiniteError: if a row is not finite; likewise.
         """
         try:
@@ -183,6 +185,7 @@ class WorkerCollector:
             raise self._failed(error) from error
         rows = rows[: self.config.total_decisions - self._frames]  # the last batch may be more than the budget
         self._check_finite(rows)
+        self._check_continuous(rows)
         self._arrived = True
         self._last_worker = int(rows[WORKER][0])
         planned = rows[PLAN, VERSION]
@@ -204,6 +207,7 @@ class WorkerCollector:
         self._numbers = range(self._next_number, self._next_number + config.workers)
         self._next_number += config.workers
         self._last_worker = None
+        self._ends = {}
         torchrl_logger.info(f"starting {config.workers} workers")
         self._workers = start_workers(parts, engine=config.engine, numbers=self._numbers, rows=config.rows_per_batch)
         self._planning = not self.in_seed_phase
@@ -245,6 +249,19 @@ class WorkerCollector:
                     f"worker {number} sent a non-finite {key!r} after {self._frames} decisions; its rows were not "
                     "stored, and all workers are started anew"
                 )
+
+    def _check_continuous(self, rows: TensorDictBase) -> None:
+        """What is missing between two batches would be taken for a step."""
+        worker = int(rows[WORKER][0])
+        end, self._ends[worker] = self._ends.get(worker), rows[-1].clone()
+        if end is None or bool(end[NEXT, "done"]):
+            return
+        if not torch.equal(rows[OBSERVATION][0], end[NEXT, OBSERVATION]):
+            self._stop()
+            raise SimulatorError(
+                f"worker {worker - self._numbers.start} sent rows that do not continue those before, after "
+                f"{self._frames} decisions; they were not stored, and all workers are started anew"
+            )
 
     def _stop(self) -> None:
         workers, self._workers, self._batches = self._workers, None, iter(())

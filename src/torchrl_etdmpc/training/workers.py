@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import sys
 import threading
+import time
 import warnings
 from dataclasses import dataclass
 from functools import partial
@@ -34,6 +36,8 @@ from torchrl_etdmpc.training.own_code import follow_own_code
 Engine = Literal["multi", "ray"]
 
 _LOOK_EVERY_S = 0.5
+# How long a process may take to say that it has the weights; a thread of its own does, whatever it is busy with.
+_PATIENCE_S = 300
 
 
 class Actor(TensorDictModuleBase):
@@ -116,6 +120,18 @@ class WorkerParts:
         follow_own_code("planner.score", config.planner.score)
 
 
+class _Processes(MultiAsyncCollector):
+    """Workers that lose no batch.
+
+    TorchRL's queue has one place for all of them. A worker that finds it taken for a second drops its batch, and goes
+    on with the episode: the rows before and behind the hole would be taken for successive ones.
+    """
+
+    @property
+    def _queue_len(self) -> int:
+        return self.num_workers  # a worker waits for an answer before its next batch
+
+
 def leave_signals_to_the_owner() -> None:
     """In a worker: Ctrl-C signals all processes of a job, but it ends when its owner says so or is gone."""
     torchrl_logger.setLevel("WARNING")
@@ -140,7 +156,7 @@ def start_workers(parts: WorkerParts, *, engine: Engine, numbers: range, rows: i
     options: dict[str, Any] = {"policy_factory": parts.make_actor, "frames_per_batch": rows}
     if engine == "multi":
         with signals_held_back():
-            return MultiAsyncCollector(
+            return _Processes(
                 makers,
                 **options,
                 total_frames=-1,
@@ -173,7 +189,7 @@ def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int 
         worker (int, optional): its place. Default: all of them.
 
     Raises:
-        RuntimeError: if a worker has ended.
+        RuntimeError: if a worker has ended, or a process does not answer for five minutes.
     """
     raised: list[BaseException] = []
 
@@ -186,11 +202,14 @@ def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int 
     # TorchRL waits for the answer of a worker that has died for ever.
     sender = threading.Thread(target=send, daemon=True)
     sender.start()
+    deadline = time.monotonic() + (_PATIENCE_S if hasattr(collector, "procs") else math.inf)
     while sender.is_alive():
         sender.join(_LOOK_EVERY_S)
         ended = ended_worker(collector)
         if ended is not None:
             raise RuntimeError(ended)
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"it has not answered for {_PATIENCE_S} seconds")
     if raised:
         raise raised[0]
 
