@@ -17,6 +17,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.envs import StepCounter
 
 pytest.importorskip("gymnasium")
 
@@ -195,6 +196,20 @@ def test_a_run_that_cannot_begin_closes_the_cluster_that_it_began(tmp_path, monk
 class RayConnection:
     def close(self) -> None:
         pass
+
+
+def test_first_episodes_that_are_cut_early_are_told_however_many_workers_play(started, monkeypatch):
+    make, workers = distributed.WorkerParts.make_env, started()
+    monkeypatch.setattr(
+        distributed.WorkerParts, "make_env", lambda *args: make(*args).append_transform(StepCounter(16))
+    )
+    learner = learner_of(config_of(workers=3))
+    for _ in range(3):
+        learner.step()
+    with pytest.warns(UserWarning, match="truncated within its first 10 env steps, but its time limit is sai"):
+        learner.step()
+    assert len(workers) == 1
+    learner.collector.shutdown()
 
 
 def test_slices_never_join_the_rows_of_two_workers(started):

@@ -84,6 +84,11 @@ class DistributedConfig(TrainConfig):
         """Decisions that come together."""
         return self.rows_per_batch
 
+    @property
+    def simulators(self) -> int:
+        """One for each worker."""
+        return self.workers
+
 
 def is_distributed(settings: Any) -> bool:
     """Whether stored settings are those of a run of workers."""
