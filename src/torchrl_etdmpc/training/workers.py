@@ -129,7 +129,7 @@ class _Processes(MultiAsyncCollector):
 
     @property
     def _queue_len(self) -> int:
-        return self.num_workers  # a worker waits for an answer before its next batch
+        return len(self.create_env_fn)  # one for each: a worker waits for an answer before its next batch
 
 
 def leave_signals_to_the_owner() -> None:
