@@ -35,7 +35,7 @@ OBSERVATION_DIM, ACTION_DIM = 5, 2
 def test_the_buffer_holds_the_budget_and_no_more_than_its_capacity(changes, capacity, tiny_config):
     config = tiny_config(**changes)
     size = build_replay(config).storage.max_size
-    allowance = config.num_envs if capacity < config.replay.capacity else 0
+    allowance = 101 * config.num_envs if capacity < config.replay.capacity else 0  # for resets that fail
     assert capacity <= size <= capacity + allowance
 
 

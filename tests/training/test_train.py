@@ -391,6 +391,35 @@ def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path, t
     assert read_table(tmp_path / "train.csv")[-1]["simulator_faults"] == 3
 
 
+class CrashAtResets(Transform):
+    """Raises at every other reset but the first."""
+
+    def __init__(self) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        self.calls = 0
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self.calls += 1
+        if self.calls % 2 == 0:
+            raise RuntimeError("no room for another simulator")
+        return tensordict_reset
+
+
+def test_a_run_of_many_failed_resets_keeps_all_of_its_rows_and_can_be_made_longer(tmp_path, tiny_config, make_run):
+    config = tiny_config(total_env_steps=240)
+    run = make_run(config, tmp_path, CrashAtResets())
+    with pytest.warns(UserWarning, match=r"no room for another simulator; training goes on"):
+        run.run()
+    assert run.learner.faults == 6
+    first = run.learner.replay[:]
+    assert len(first) == 120 + 6  # the step before a reset that fails is not counted
+    assert first["collector", "traj_ids"][0] == 0
+    run.log.directory.close()
+    longer = make_run(dataclasses.replace(config, total_env_steps=320), tmp_path, resume=True)
+    assert longer.run()["env_steps"] == 320
+    assert torch.equal(longer.learner.replay[:126]["observation"], first["observation"])
+
+
 def test_a_run_that_went_on_after_too_many_failures_has_as_many_new_ones(tmp_path, tiny_config, make_run):
     config = tiny_config(max_faults=3)
     run = make_run(config, tmp_path, Crash(33, 34, 35))

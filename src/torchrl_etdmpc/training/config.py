@@ -39,6 +39,7 @@ def typed_name(name: str) -> str:
     return f"task.{name}" if name in TASK_SETTINGS else name
 
 
+_FAILED_RESETS = 100  # that a buffer has room for
 MOST_EPISODES = 10_000
 """Of one evaluation: each is an environment in memory."""
 
@@ -354,8 +355,11 @@ class TrainConfig:
 
     @property
     def replay_rows(self) -> int:
-        """Rows of the buffer: as many as the budget can fill, at most its capacity."""
-        return min(self.replay.capacity, self.total_decisions + self.num_envs)
+        """Rows of the buffer: as many as the budget can fill, at most its capacity.
+
+        Steps before a reset that failed are stored beside the budget.
+        """
+        return min(self.replay.capacity, self.total_decisions + self.num_envs * (1 + _FAILED_RESETS))
 
     @property
     def partial_slices(self) -> bool:
