@@ -146,16 +146,16 @@ def test_a_sweep_leaves_no_folder_but_those_of_its_runs(run_command, tmp_path, m
     [
         ("csv=a.csv", "csv='${seed}/a.csv'"),
         ("video=films/a.mp4", "video='films/${seed}/a.mp4'"),
-        ("video=~/a.gif", "video='/home/me/${seed}/a.gif'"),
+        ("video=~/a.gif", "video='/somewhere/${seed}/a.gif'"),
     ],
 )
 def test_no_two_runs_of_a_sweep_write_the_same_file(run_command, monkeypatch, output, remedy):
-    monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.setenv("HOME", "/somewhere")
     message = run_command(
         "--multirun", "checkpoint=a.pt", "seed=1,2", "planner.horizon=3", output, config_class=EvaluateConfig
     )
     assert message == (
-        f"error: {output.replace('~', '/home/me')} would be that of several runs, which differ in seed; put what "
+        f"error: {output.replace('~', '/somewhere')} would be that of several runs, which differ in seed; put what "
         f"differs into it, e.g. {remedy}."
     )
 

@@ -225,8 +225,9 @@ def _checked(arguments: list[str], config_class: type) -> list[str]:
         if setting.default is dataclasses.MISSING and name not in given and not {"--cfg", "-c"} & set(flags):
             raise ValueError(f"{name}=... is missing: {setting.meaning[0].lower()}{setting.meaning[1:]}")
     if sweep:
-        for name in (name for name in _OUTPUTS if name in settings):
-            _require_one_each(name, settings[name].default, checked)
+        for name in _OUTPUTS:
+            if name in settings:
+                _require_one_each(name, settings[name].default, checked)
     return flags + checked  # Hydra takes no flag between settings
 
 

@@ -124,8 +124,8 @@ def help_text(
         lines += ["", "groups of settings, e.g. --help planner:"]
         for name, meaning in groups.items():
             lines += _wrap(f"{name + '.*':14}{meaning}", width, initial_indent="  ", subsequent_indent=" " * 16)
-    lines += ["", "also:"]
     swept = "seed=1,2" if "checkpoint" in settings else "task=a,b"
+    lines += ["", "also:"]
     for name, meaning in {
         **({"task=list": "prints all tasks by suite"} if "task" in settings else {}),
         **({"--help preset=cpu": "shows the defaults of that preset"} if "preset" in settings else {}),
