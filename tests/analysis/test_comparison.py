@@ -192,9 +192,21 @@ def test_wherever_a_curve_is_read_a_seed_that_has_ended_does_not_count():
     assert returns.loc[("ours", walk), "mean"] == pytest.approx(900)
     final = cell(run(runs, steps=(), **(options | {"budget": 50_000, "grid_step": 25_000})).finals, "ours", walk)
     assert (final["mean"], final["standard_error"]) == (900, 0)
-    # 600 up to 40,000 and 900 from 50,000 on
-    area = cell(run(runs, steps=(), **(options | {"grid_step": 10_000})).areas, "ours", walk)["auc"]
-    assert area == pytest.approx(0.01 * (600 / 2 + 600 + 600 + 900 + 900 / 2) / 800)
+    areas = run(runs, steps=(), **(options | {"grid_step": 10_000})).areas
+    assert cell(areas, "ours", walk)[["auc", "standard_error", "seeds"]].tolist() == pytest.approx(
+        [0.04 * 900 / 800, 0, 2]
+    )
+
+
+def test_an_area_is_of_the_seeds_whose_curves_cover_the_grid():
+    """The mean curve of seeds that begin or end apart is no run's; its area would be the largest here."""
+    early = seed_curves("part", lambda *_: 900.0, seeds=(2,), steps=STEPS[:3], tasks=TASKS[:1])
+    runs = [seed_curves("part", lambda *_: 100.0, seeds=(1,)), early]
+    areas = run(pd.concat([OURS, *runs]), start=50_000).areas
+    assert cell(areas, "part", TASKS[0])[["auc", "seeds"]].tolist() == pytest.approx([0.15 * 100 / 800, 1])
+    assert np.isnan(cell(areas, "part", TASKS[0])["standard_error"])
+    areas = run(pd.concat([OURS, early]), start=50_000).areas
+    assert np.isnan(cell(areas, "part", TASKS[0])["auc"])
 
 
 def test_a_seed_of_the_normaliser_that_has_ended_at_the_benchmark_s_budget_does_not_count():
@@ -275,6 +287,9 @@ def test_a_variant_without_a_pair_is_named():
     comparison = run(pd.concat([OURS, alone]), base="ours", variants=["alone"])
     assert comparison.paired.empty
     assert "alone shares no task and seed with ours: not paired." in comparison.notes
+    short = seed_curves("short", ours, steps=STEPS[:4])
+    notes = run(pd.concat([OURS, short]), base="ours", variants=["short"]).notes
+    assert "short and ours share no task and seed on which both reach 200,000 env steps: not paired." in notes
 
 
 def test_returns_at_the_budget_may_lie_on_the_line_from_the_untrained_agent_if_asked_for():
@@ -362,7 +377,9 @@ def test_the_start_of_the_grid_can_be_chosen():
 
 
 def test_a_complete_comparison_needs_no_note_but_that_on_methods_without_seeds():
-    assert run().notes == ("No interval of the AUC for BMPC: it needs the curves of at least two seeds.",)
+    assert run().notes == (
+        "No interval of the AUC for BMPC: it needs the curves of at least two seeds on the whole grid.",
+    )
 
 
 def test_one_seed_has_a_mean_and_no_interval_and_a_note_says_so():
@@ -379,7 +396,7 @@ def test_one_task_with_an_interval_of_its_area_is_enough():
     alone = seed_curves("part", ours, seeds=(1,), tasks=TASKS[:1])
     comparison = run(pd.concat([OURS, alone, seed_curves("part", ours, tasks=TASKS[1:])]))
     assert [note for note in comparison.notes if note.startswith("No interval")] == [
-        "No interval of the AUC for BMPC: it needs the curves of at least two seeds."
+        "No interval of the AUC for BMPC: it needs the curves of at least two seeds on the whole grid."
     ]
 
 

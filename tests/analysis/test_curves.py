@@ -225,6 +225,26 @@ def test_a_first_run_whose_settings_are_not_known_hides_no_difference():
     assert mixed_settings(runs) == ["ours has runs with different settings: optim.lr is 1 in b and 2 in c"]
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (2, 1, 0)])
+def test_a_setting_that_an_older_run_does_not_know_is_compared_between_the_others(order):
+    known = [{"optim.lr": 1}, {"optim.lr": 1, "loss.new": 0.5}, {"optim.lr": 1, "loss.new": 0.0}]
+    runs = [
+        Run(Path(str(n)), "ours", "walker-walk", n, True, pd.DataFrame(), settings=values)
+        for n, values in enumerate(known)
+    ]
+    (line,) = mixed_settings([runs[n] for n in order])
+    assert line.startswith("ours has runs with different settings: loss.new is ")
+
+
+def test_a_run_without_evaluations_is_found_so_that_its_reader_says_so(tmp_path):
+    run = make_run(tmp_path / "run", HEADER + line(0, 1.0))
+    (run / "summary.json").write_text("{}")
+    (run / "eval.csv").unlink()
+    assert find_runs([tmp_path]) == [run]
+    with pytest.raises(FileNotFoundError, match=r"run has no eval\.csv, which holds the evaluations of a run"):
+        read_run(run)
+
+
 def test_a_run_on_a_task_of_one_s_own_is_read_without_its_code(tmp_path):
     run = make_run(tmp_path / "run", HEADER + line(0, 1.0))
     (run / "config.yaml").write_text('{task: "mine:make", preset: cpu, seed: 1, episode_length: 200}')

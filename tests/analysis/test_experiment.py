@@ -89,6 +89,23 @@ def test_a_run_that_is_a_step_short_of_its_budget_is_whole_and_one_that_is_a_ten
         assert len(incomplete_runs(read(root), [read_experiment(plan(root, variants=["a"], budget=budget))])) == short
 
 
+def test_a_run_that_is_a_step_short_is_named_where_it_has_no_value_in_the_comparison(tmp_path):
+    make_run(tmp_path, "a", 1, last=10_000), make_run(tmp_path, "a", 2, last=9_950)
+    for budget, short in ((None, []), (9_950, []), (10_000, [2]), (20_000, [2])):
+        lines = incomplete_runs(read(tmp_path), budget=budget)
+        assert lines == [
+            f"a on walker-walk with seed {seed}: ends at 9,950 env steps, others at 10,000" for seed in short
+        ]
+
+
+@pytest.mark.parametrize("inner", ["m", "z"])
+def test_of_two_experiments_around_a_run_the_inner_one_s_budget_counts(tmp_path, inner):
+    roots = plan(tmp_path, variants=["a"], budget=200), plan(tmp_path / inner, variants=["a"], seeds=[1])
+    make_run(roots[1], "a", 1)
+    runs = [Run.read(path, method="a") for path in find_runs([tmp_path])]
+    assert not any("its budget" in line for line in incomplete_runs(runs, map(read_experiment, roots)))
+
+
 def test_without_a_plan_a_seed_that_another_method_has_on_the_task_is_missed(tmp_path):
     for variant, seed in (("a", 1), ("a", 2), ("b", 1)):
         make_run(tmp_path, variant, seed)

@@ -14,7 +14,7 @@ from torchrl_etdmpc.analysis import (  # noqa: E402
     add_interval,
     aggregate,
     auc,
-    auc_standard_error,
+    auc_of_seeds,
     estimate,
     interpolate,
     normalise,
@@ -189,8 +189,9 @@ def test_no_line_leaves_the_evaluation_of_the_untrained_agent_unless_asked_for()
 def test_a_curve_without_an_evaluation_on_the_grid_before_its_first_has_no_area_unless_asked_for():
     table = seed_curves({1: {0: 0.0, 100: 10.0, 200: 10.0}, 2: {0: 0.0, 200: 20.0}})
     grid = np.array([0.0, 100.0, 200.0])
-    assert auc_standard_error(table, grid)["standard_error"].isna().all()
-    assert auc_standard_error(table, grid, from_zero=True)["standard_error"].notna().all()
+    assert auc_of_seeds(table, grid)["seeds"].item() == 1
+    assert auc_of_seeds(table, grid)["standard_error"].isna().all()
+    assert auc_of_seeds(table, grid, from_zero=True)["standard_error"].notna().all()
     late = interpolate(curve([0, 200], [0.0, 20.0]), grid)
     assert np.isnan(area(late))
 
@@ -404,20 +405,28 @@ def test_a_curve_that_does_not_cover_the_grid_has_no_area_and_the_others_keep_th
 def test_the_error_of_an_area_is_that_of_the_seeds_areas_whose_mean_is_the_area_of_the_mean(rows, seed):
     steps = (0, 100_000, 400_000)
     table = seed_curves({n: dict(zip(steps, row, strict=True)) for n, row in enumerate(rows)})
-    (row,) = auc_standard_error(shuffled(table, seed), np.array(steps)).itertuples()
+    (row,) = auc_of_seeds(shuffled(table, seed), np.array(steps)).itertuples()
     areas = [0.1 * (a + b) / 2 + 0.3 * (b + c) / 2 for a, b, c in rows]
     assert row.standard_error == pytest.approx(np.std(areas, ddof=1) / len(areas) ** 0.5, rel=1e-6, abs=1e-9)
+    assert (row.auc, row.seeds) == (pytest.approx(np.mean(areas), abs=1e-9), len(areas))
     assert area(estimate(table)) == pytest.approx(np.mean(areas), abs=1e-9)
 
 
 def test_seeds_on_unequal_grids_each_have_their_own_area():
     table = seed_curves({1: {1e6: 1.0, 2e6: 1.0}, 2: {1e6: 0.0, 1.25e6: 0.5, 2e6: 2.0}})
-    (row,) = auc_standard_error(table, np.array([1e6, 1.5e6, 2e6])).itertuples()
-    assert row.standard_error == pytest.approx(0.0)  # both areas are 1: a constant and the line 2 x - 2
+    (row,) = auc_of_seeds(table, np.array([1e6, 1.5e6, 2e6])).itertuples()
+    assert (row.auc, row.standard_error) == pytest.approx((1.0, 0.0))  # both are 1: a constant and the line 2 x - 2
 
 
-@pytest.mark.parametrize("ends", [(10,), (10, 9), (10, 9, 10)])
-def test_one_seed_or_one_that_does_not_cover_the_grid_leaves_the_error_unknown(ends):
-    seeds = {seed: {0: 1.0, end: seed + 2.0} for seed, end in enumerate(ends)}
-    (row,) = auc_standard_error(seed_curves(seeds), np.array([0.0, 10.0])).itertuples()
+@pytest.mark.parametrize("ends", [(10,), (10, 9), (9, 10, 9)])
+def test_one_seed_that_covers_the_grid_has_an_area_and_no_error(ends):
+    seeds = {seed: {1: 1.0, end: 1.0} for seed, end in enumerate(ends)}
+    (row,) = auc_of_seeds(seed_curves(seeds), np.array([1.0, 10.0])).itertuples()
+    assert (row.auc, row.seeds) == (pytest.approx(9e-6), 1)
     assert np.isnan(row.standard_error)
+
+
+def test_a_seed_that_does_not_cover_the_grid_does_not_count():
+    table = seed_curves({1: {1e6: 1.0, 2e6: 1.0}, 2: {1e6: 900.0, 1.9e6: 900.0}, 3: {1e6: 3.0, 2e6: 3.0}})
+    (row,) = auc_of_seeds(table, np.array([1e6, 2e6])).itertuples()
+    assert (row.auc, row.standard_error, row.seeds) == pytest.approx((2.0, 1.0, 2))

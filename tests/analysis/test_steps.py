@@ -72,6 +72,20 @@ def test_where_a_method_has_a_curve_and_a_quote_the_curve_counts():
         assert found.loc[(method, MEAN, 50), ["mean", "kind", "tasks"]].tolist() == [mean, kind, 2]
 
 
+def test_of_a_method_that_is_partly_quoted_the_cells_are_marked_and_a_mean_with_an_interpolated_one_is_such():
+    estimates = pd.concat([curve("a", "x", {50: 1.0}), curve("b", "x", {40: 1.0, 60: 3.0})])
+    points = pd.concat([quote(method, "y", 50, 9.0) for method in "ab"])
+    found = returns_at(estimates, points, steps=[50], tasks=TASKS, methods=["a", "b"])
+    assert found.set_index(["method", "task"]).loc[[("a", MEAN), ("b", MEAN)], "kind"].tolist() == [
+        "quoted",
+        "interpolated",
+    ]
+    lines = step_table(found, 50, tasks=TASKS, methods=["a", "b"]).splitlines()
+    assert lines[0] == "| task | a | b |"
+    assert lines[3:] == ["| y | 9 (quoted) | 9 (quoted) |", f"| {MEAN} | 5 (quoted) | ≈ 6 |"]
+    assert "| a (quoted) | 5 |" in overview(found, tasks=TASKS, methods=["a", "b"])
+
+
 def test_quoted_points_stand_at_their_step_only_and_have_no_interval():
     found = table()
     assert found.loc[("paper", MEAN, 50), ["mean", "kind", "tasks"]].tolist() == [80, "quoted", 2]

@@ -489,6 +489,42 @@ def test_one_broken_run_is_skipped_and_named(run_main, capfd):
     assert second == "skipped runs/c: runs/c has neither config.yaml nor summary.json, which name its task and seed."
 
 
+def test_a_finished_run_whose_evaluations_are_lost_is_named(run_main, capfd):
+    make_run("runs/a")
+    (make_run("runs/b", seed=2) / "eval.csv").unlink()
+    run_main("runs", "--reference")
+    out, err = capfd.readouterr()
+    assert "1 missing or unfinished (skipped runs/b: runs/b has no eval.csv" in out
+    assert err.startswith("skipped runs/b: runs/b has no eval.csv")
+
+
+def test_with_a_benchmark_that_was_asked_for_only_its_runs_are_spoken_of(run_main, capfd):
+    root = make_experiment()
+    (make_run("runs/exp/a/dog-run/seed1", task="dog-run") / "summary.json").unlink()
+    make_run("runs/exp/a/dog-walk/seed1", task="dog-walk")
+    plan = json.loads((root / "experiment.yaml").read_text())
+    (root / "experiment.yaml").write_text(json.dumps(plan | {"tasks": [*plan["tasks"], "dog-run", "dog-walk"]}))
+    run_main("runs", "--benchmark", "dmc-easy")
+    out, err = capfd.readouterr()
+    assert "missing" not in out
+    assert err == "2 runs on dog-run, dog-walk, not of dmc-easy: left out\n"
+    assert f"- {err[:-1]}.\n" in Path("report", "index.md").read_text()
+
+
+def test_a_method_with_a_curve_and_a_quote_has_one_column(run_main):
+    make_experiment()
+    rows = [f"theirs,walker-walk,{step},5,1,3\n" for step in (10_000, 20_000, 50_000)]
+    Path("curves.csv").write_text("method,task,env_steps,mean,standard_error,seeds\n" + "".join(rows))
+    Path("points.csv").write_text("method,task,env_steps,mean,source\ntheirs,cup-catch,50000,9,a talk\n")
+    run_main("runs", "--reference", "curves.csv", "--points", "points.csv")
+    page = Path("report", "index.md").read_text()
+    heads = [line for line in page.splitlines() if line.startswith("| task |")]
+    assert heads and all(line.count("theirs") <= 1 for line in heads)
+    assert "| cup-catch | 51 | 61 | 9 (quoted) |" in re.sub(r" \[[^]]*\] \(2\)| \(2\)", "", page).replace(
+        "52", "51"
+    ).replace("62", "61")
+
+
 def test_without_pandas_there_is_one_line(monkeypatch, refused):
     make_run("runs/a")
     for name in [name for name in sys.modules if name.partition(".")[2].startswith("analysis")]:
@@ -735,6 +771,20 @@ def test_a_file_of_baselines_may_have_numbers_for_names_and_says_if_it_is_of_no_
     assert "| 64 | " in page
     assert f"- {text}.\n" in page
     assert "Missing and unfinished" not in page
+
+
+def test_a_misspelt_task_of_a_baseline_is_named_though_others_fit(run_main, capfd):
+    make_run("runs/a")
+    own = Path(make_baseline("own.csv"))
+    own.write_text(own.read_text() + "BMPC,Walker-run,100000,5,1.0,5\nBMPC,dog-run,100000,5,1.0,5\n")
+    Path("points.csv").write_text("method,task,env_steps,mean,source\nx,walker-walk,50000,9,a\nx,walk,50000,9,a\n")
+    run_main("runs", "--reference", "own.csv", "--points", "points.csv", "--out", "out")
+    lines = capfd.readouterr().err.splitlines()
+    assert lines == [
+        f"{file}: no benchmark has the task {task}: left out"
+        for file, task in (("own.csv", "Walker-run"), ("points.csv", "walk"))
+    ]
+    assert all(f"- {line}.\n" in Path("out", "index.md").read_text() for line in lines)
 
 
 def test_a_bar_in_a_name_makes_no_column(run_main):

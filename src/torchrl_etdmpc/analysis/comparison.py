@@ -15,7 +15,7 @@ from torchrl_etdmpc.analysis.statistics import (
     NORMALISER,
     aggregate,
     auc,
-    auc_standard_error,
+    auc_of_seeds,
     estimate,
     interpolate,
     normalise,
@@ -186,9 +186,7 @@ def compare(
     seed_curves = seed_curves[seed_curves["task"].isin(tasks) & seed_curves["method"].isin(methods)]
     grid = shared_grid(estimates, budget, grid_step, start=start)
 
-    on_grid = normalise(interpolate(estimates, grid, from_zero=from_zero), constants)
-    errors = auc_standard_error(normalise(seed_curves, constants), grid, from_zero=from_zero)
-    areas = auc(on_grid).merge(errors, on=["method", "task"], how="left")
+    areas = _areas(estimates, seed_curves, constants, grid, from_zero=from_zero)
     areas = pd.concat([areas, _aggregate_rows(areas.rename(columns={"auc": "mean"}), tasks, "auc")])
 
     finals = interpolate(estimates, np.array([float(budget)]), from_zero=from_zero).drop(columns="env_steps")
@@ -204,7 +202,7 @@ def compare(
         ),
     }
     paired = set(tables["paired"]["variant"])
-    notes += [f"{name} shares no task and seed with {base}: not paired." for name in variants if name not in paired]
+    notes += [_why_unpaired(seed_curves, name, base, budget) for name in variants if name not in paired]
     known = (seed_curves, estimates, evaluated, constants, tasks, methods, budget, tables["areas"], tables["finals"])
     notes = (*_notes(*known), *notes)
     return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **tables)
@@ -247,6 +245,23 @@ def begins(curves: pd.DataFrame) -> pd.Series:
     return trained.groupby(["method", "task"], sort=False)["env_steps"].min()
 
 
+def _areas(
+    estimates: pd.DataFrame, seed_curves: pd.DataFrame, constants: pd.Series, grid: np.ndarray, *, from_zero: bool
+) -> pd.DataFrame:
+    """Of the mean curves; where seeds are known, the mean of those of the seeds that cover the grid.
+
+    The mean curve of seeds that begin or end apart is nobody's, and neither is the area below it.
+    """
+    areas = auc(normalise(interpolate(estimates, grid, from_zero=from_zero), constants))
+    known = auc_of_seeds(normalise(seed_curves, constants), grid, from_zero=from_zero)
+    areas = areas.merge(known, on=["method", "task"], how="left", suffixes=("", "_of_seeds"))
+    if not from_zero:
+        whose = areas["seeds_of_seeds"].notna()
+        for name in ("auc", "seeds"):
+            areas[name] = areas[f"{name}_of_seeds"].where(whose, areas[name])
+    return areas[["method", "task", "auc", "seeds", "standard_error"]]
+
+
 def _aggregate_rows(table: pd.DataFrame, tasks: tuple[str, ...], column: str) -> pd.DataFrame:
     rows = aggregate(table.assign(env_steps=0), tasks).drop(columns="env_steps")
     return rows.rename(columns={"mean": column}).assign(task=AGGREGATE)
@@ -278,7 +293,8 @@ def _notes(
         name for name in dict.fromkeys(known["method"]) if known[known["method"] == name]["standard_error"].isna().all()
     ]
     if unknown:
-        yield f"No interval of the AUC for {', '.join(unknown)}: it needs the curves of at least two seeds."
+        names = ", ".join(unknown)
+        yield f"No interval of the AUC for {names}: it needs the curves of at least two seeds on the whole grid."
     known = finals[(finals["task"] != AGGREGATE) & finals["mean"].notna()]
     between = [row.method for row in known.itertuples() if (row.method, row.task, budget) not in evaluated]
     if between:
@@ -319,6 +335,14 @@ def _left_out(estimates: pd.DataFrame, budget: int) -> Iterator[str]:
     if len(late := first[first > budget]):
         names = ", ".join(f"{method} (from {step:,.0f})" for method, step in late.items())
         yield f"Not evaluated by {budget:,} env steps on these tasks, so left out: {names}."
+
+
+def _why_unpaired(seed_curves: pd.DataFrame, variant: str, base: str | None, budget: int) -> str:
+    runs = [seed_curves[seed_curves["method"] == name] for name in (variant, base)]
+    one, other = (set(zip(rows["task"], rows["seed"], strict=True)) for rows in runs)
+    if one & other:
+        return f"{variant} and {base} share no task and seed on which both reach {budget:,} env steps: not paired."
+    return f"{variant} shares no task and seed with {base}: not paired."
 
 
 def _both_ways(seed_curves: pd.DataFrame, means: pd.DataFrame, tasks: tuple[str, ...]) -> Iterator[str]:

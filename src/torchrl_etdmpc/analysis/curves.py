@@ -38,11 +38,15 @@ _NO_SETTING_OF_THE_METHOD = (
     *("checkpoint_keep", "max_faults", "max_skipped", "workers", "engine", "address", "overlap"),
 )
 _EVAL = RunDirectory("").eval.name
+_OF_A_RUN = {_EVAL, RunDirectory("").train.name, RunDirectory("").summary.name}
 _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.values() for task in benchmark.tasks}
 
 
 def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     """The run directories in or below the paths: those that hold an ``eval.csv``.
+
+    What should hold one is among them, a folder with a ``train.csv`` or a ``summary.json``: who reads it learns that it
+    does not.
 
     Args:
         paths (iterable of str or Path): run directories, or folders of run directories at any depth.
@@ -64,15 +68,15 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     for path in map(Path, paths):
         if not path.exists():
             raise FileNotFoundError(f"no such run directory: {path}.")
-        found = _folders_with(_EVAL, path)
+        found = _folders_with(_OF_A_RUN, path)
         if not found:
             raise FileNotFoundError(f"no runs found in {path}; a run directory holds an {_EVAL}.")
         runs |= found
     return sorted(runs)
 
 
-def _folders_with(name: str, path: Path) -> set[Path]:
-    """Also behind links to folders, each of them once.
+def _folders_with(names: set[str], path: Path) -> set[Path]:
+    """With one of the files; also behind links to folders, each of them once.
 
     What cannot be looked into is among them, and so are links that lead nowhere and stand beside a run: who reads them
     learns why not.
@@ -89,7 +93,7 @@ def _folders_with(name: str, path: Path) -> set[Path]:
             folders.clear()
             continue
         seen.add(real)
-        if name in files:
+        if not names.isdisjoint(files):
             found[real] = Path(folder)
         nowhere += [Path(folder, file) for file in files if not os.path.exists(os.path.join(folder, file))]
     beside = {run.parent for run in found.values()}
@@ -221,6 +225,8 @@ def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
         ValueError: if it is not what it should be.
     """
     file = RunDirectory(run_dir).eval
+    if not file.is_file():
+        raise FileNotFoundError(f"{run_dir} has no {file.name}, which holds the evaluations of a run.")
     text = file.read_text(encoding="utf-8", errors="replace")
     table = _parse(text[: text.rfind("\n") + 1], file, ("env_steps", "return_mean"), empty=True)
     return table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
@@ -289,13 +295,15 @@ def mixed_settings(runs: Iterable[Run]) -> list[str]:
     >>> mixed_settings(ours)
     ['ours has runs with different settings: optim.lr is 0.001 in a and 0.0003 in b']
     """
-    first: dict[str, Run] = {}
+    first: dict[str, dict[str, Run]] = {}  # of each method, the first run that knows the setting
     lines: dict[str, str] = {}
     for run in runs:
-        other = first.setdefault(run.method, run) if run.settings else run
-        names = [name for name in other.settings if name in run.settings and run.settings[name] != other.settings[name]]
+        others = first.setdefault(run.method, {})
+        names = [name for name in others if name in run.settings and run.settings[name] != others[name].settings[name]]
+        others |= {name: run for name in run.settings if name not in others}
         if names and run.method not in lines:
             name, more = names[0], f", and {len(names) - 1} more" if len(names) > 1 else ""
+            other = others[name]
             lines[run.method] = (
                 f"{run.method} has runs with different settings: {name} is {other.settings[name]} in {other.path} and "
                 f"{run.settings[name]} in {run.path}{more}"

@@ -113,22 +113,26 @@ def experiment_root(run: Path) -> Path | None:
     return None
 
 
-def incomplete_runs(runs: Sequence[Run], experiments: Iterable[Experiment] = ()) -> list[str]:
+def incomplete_runs(
+    runs: Sequence[Run], experiments: Iterable[Experiment] = (), *, budget: float | None = None
+) -> list[str]:
     """Names every run that is missing or not finished, a line each.
 
     A run is missing if its experiment lists it, or if another method of the same runs has one with this task and seed
     on a task that both have. It is not finished without its summary, or if it ends before the budget of its experiment
-    or before the others on its task.
+    or before the others on its task. One that is a step short of these is whole, unless it has no value at the budget
+    of a comparison.
 
     Args:
         runs (sequence of Run): those that were read.
         experiments (iterable of Experiment): of which the runs should be all.
+        budget (float, optional): env steps at which the runs are compared.
 
     >>> incomplete_runs([])
     []
     """
     experiments = list(experiments)
-    lines = list(_unfinished(runs, experiments))
+    lines = list(_unfinished(runs, experiments, budget))
     there = {(run.method, run.task, run.seed) for run in runs}
     planned = [
         (variant, task, seed)
@@ -145,12 +149,13 @@ def incomplete_runs(runs: Sequence[Run], experiments: Iterable[Experiment] = ())
     return lines + [f"{method} on {task} with seed {seed}: no run" for method, task, seed in missing]
 
 
-def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[str]:
+def _unfinished(runs: Sequence[Run], experiments: list[Experiment], compared: float | None) -> Iterator[str]:
     longest: dict[str, float] = {}
     for run in runs:
         longest[run.task] = max(longest.get(run.task, 0.0), run.last)  # a NaN is never the larger one
     for run in runs:
-        plan = next((plan for plan in experiments if plan.root.absolute() in run.path.absolute().parents), None)
+        plans = [plan for plan in experiments if plan.root.absolute() in run.path.absolute().parents]
+        plan = max(plans, key=lambda plan: len(plan.root.absolute().parts), default=None)  # the innermost one
         budget = plan.env_steps(run.task, run.method) if plan else None
         target = budget or longest[run.task]
         where = f"{run.method} on {run.task} with seed {run.seed}"
@@ -161,5 +166,5 @@ def _unfinished(runs: Sequence[Run], experiments: list[Experiment]) -> Iterator[
             yield f"{where}: not finished, {ends}"
         elif run.last == 0:
             yield f"{where}: no evaluation after 0 env steps"
-        elif not run.last >= target * (1 - SLACK):
+        elif not run.last >= target * (1 - SLACK) or (compared is not None and run.last < min(target, compared)):
             yield f"{where}: {ends}, {'its budget is' if budget else 'others at'} {target:,.0f}"

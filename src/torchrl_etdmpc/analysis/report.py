@@ -213,7 +213,7 @@ def _steps(comparison: Comparison) -> str:
     returns, points = comparison.returns, comparison.points
     if returns.empty:
         return ""
-    names = {"tasks": comparison.tasks, "methods": [*comparison.methods, *dict.fromkeys(points["method"])]}
+    names = {"tasks": comparison.tasks, "methods": [*dict.fromkeys([*comparison.methods, *points["method"]])]}
     steps = sorted(returns["env_steps"].unique())
     parts = [
         "## Returns at fixed numbers of environment steps\n",

@@ -157,7 +157,7 @@ def normalisers(estimates: pd.DataFrame, budget: float, method: str = NORMALISER
         method (str): by default BMPC.
 
     Returns:
-        Series: index task; without the tasks on which the method has no value at the budget.
+        Series: index task; without the tasks on which the method has no value at the budget, or 0.
 
     >>> curve = {"method": "BMPC", "task": "t", "seed": 1, "env_steps": [0, 10], "return_mean": [0.0, 500.0]}
     >>> estimates = seed_estimates(pd.DataFrame(curve))
@@ -165,7 +165,7 @@ def normalisers(estimates: pd.DataFrame, budget: float, method: str = NORMALISER
     np.float64(500.0)
     """
     table = interpolate(estimates[estimates["method"] == method], np.array([budget]))
-    return table.dropna(subset="mean").set_index("task")["mean"].astype(float)
+    return table[table["mean"].notna() & (table["mean"] != 0)].set_index("task")["mean"].astype(float)
 
 
 def normalise(table: pd.DataFrame, constants: pd.Series) -> pd.DataFrame:
@@ -245,10 +245,10 @@ def auc(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*key, "auc", "seeds"])
 
 
-def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray, *, from_zero: bool = False) -> pd.DataFrame:
-    """Standard error of the mean over seeds of their areas (thesis D.1: areas per seed, then their mean).
+def auc_of_seeds(seed_curves: pd.DataFrame, grid: np.ndarray, *, from_zero: bool = False) -> pd.DataFrame:
+    """Mean over seeds of their areas, and its standard error (thesis D.1: areas per seed, then their mean).
 
-    NaN for one seed, and where a seed's own curve does not cover the grid.
+    Of the seeds whose own curve covers the grid; NaN where none does. The standard error is NaN for one seed.
 
     Args:
         seed_curves (DataFrame): normalised or not.
@@ -256,17 +256,18 @@ def auc_standard_error(seed_curves: pd.DataFrame, grid: np.ndarray, *, from_zero
         from_zero (bool): see :func:`interpolate`.
 
     Returns:
-        DataFrame: ``method, task, standard_error``.
+        DataFrame: ``method, task, auc, standard_error, seeds``, the last one the number of seeds that cover the grid.
 
-    >>> curve = {"method": "a", "task": "t", "env_steps": [10, 20]}
-    >>> curves = pd.concat([pd.DataFrame({**curve, "seed": seed, "return_mean": 1.0}) for seed in (1, 2)])
-    >>> auc_standard_error(curves, np.array([10, 20]))["standard_error"].tolist()
-    [0.0]
+    >>> curve = {"method": "a", "task": "t", "env_steps": [0, 1_000_000]}
+    >>> curves = pd.concat([pd.DataFrame({**curve, "seed": seed, "return_mean": seed}) for seed in (1, 3)])
+    >>> auc_of_seeds(curves, np.array([0, 1_000_000]), from_zero=True)
+      method task  auc  standard_error  seeds
+    0      a    t  2.0             1.0      2
     """
     areas = auc(interpolate(seed_estimates(seed_curves), grid, from_zero=from_zero))
     groups = areas.groupby(["method", "task"], sort=False)["auc"]
-    errors = groups.agg(lambda values: values.std(skipna=False) / np.sqrt(len(values)))
-    return errors.rename("standard_error").reset_index()
+    table = groups.agg(auc="mean", standard_error="sem", seeds="count").reset_index()
+    return table.assign(seeds=table["seeds"].where(table["seeds"] > 0))
 
 
 def seed_estimates(seed_curves: pd.DataFrame) -> pd.DataFrame:

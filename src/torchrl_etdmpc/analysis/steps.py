@@ -15,6 +15,7 @@ STEPS = (20_000, 50_000, 100_000, 200_000)
 """Env steps at which reports table returns."""
 MEAN = "Mean over tasks"
 """The name of the row over all tasks in tables of returns."""
+_KINDS = ("evaluated", "quoted", "interpolated")
 _COLUMNS = ("env_steps", "method", "task", "mean", "standard_error", "lower", "upper", "seeds", "tasks", "kind")
 
 
@@ -52,8 +53,9 @@ def returns_at(
 
     Returns:
         DataFrame: a row for every value that exists, ``env_steps, method, task, mean, standard_error, lower, upper,
-        seeds, tasks, kind``. ``kind`` is ``evaluated``, ``interpolated`` (between two evaluations) or ``quoted``. The
-        task :data:`MEAN` is the mean over ``tasks`` tasks, its standard error that of independent tasks.
+        seeds, tasks, kind``. ``kind`` is ``evaluated``, ``quoted`` or ``interpolated`` (between two evaluations). The
+        task :data:`MEAN` is the mean over ``tasks`` tasks, its standard error that of independent tasks, its kind the
+        last of these three that one of them has.
 
     >>> rows = [("a", "x", 50, 1.0, 0.3, 3), ("a", "y", 50, 2.0, 0.4, 5), ("a", "y", 90, 4.0, 0.4, 5)]
     >>> curves = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"])
@@ -82,9 +84,9 @@ def returns_at(
     means = groups.agg(
         mean=("mean", "mean"),
         standard_error=("standard_error", lambda errors: np.sqrt(np.square(errors).sum(skipna=False)) / len(errors)),
-        seeds=("seeds", "min"),
+        seeds=("seeds", lambda seeds: seeds.min(skipna=False)),
         tasks=("tasks", "sum"),
-        kind=("kind", "max"),  # interpolated if one of them is
+        kind=("kind", lambda kinds: max(kinds, key=_KINDS.index)),
     )
     table = pd.concat([table, means.reset_index().assign(task=MEAN)] if len(table) else [table], ignore_index=True)
     return add_interval(table).reindex(columns=list(_COLUMNS))
@@ -116,11 +118,12 @@ def step_table(returns: pd.DataFrame, step: float, *, tasks: Sequence[str], meth
     here = returns[returns["env_steps"] == step]
     columns = [method for method in methods if method in set(here["method"])]
     rows = {(row.method, row.task): row for row in here.itertuples()}
-    quoted = set(here[here["kind"] == "quoted"]["method"])
+    quoted = _all_quoted(here)
     heads = [escape(method) + " (quoted)" * (method in quoted) for method in columns]
     lines = ["| task | " + " | ".join(heads) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in [*tasks, MEAN]:
-        cells = [_cell(rows.get((method, task)), len(tasks) if task == MEAN else 1) for method in columns]
+        of = len(tasks) if task == MEAN else 1
+        cells = [_cell(rows.get((method, task)), of, mark=method not in quoted) for method in columns]
         lines.append(f"| {task} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -142,19 +145,24 @@ def overview(returns: pd.DataFrame, *, tasks: Sequence[str], methods: Sequence[s
         return [(row is None or row.tasks < len(tasks), -row.mean if row is not None else 0.0) for row in found]
 
     shown = sorted((method for method in methods if method in set(means["method"])), key=place)
-    quoted = set(means[means["kind"] == "quoted"]["method"])
+    quoted = _all_quoted(means)
     lines = ["| method | " + " | ".join(f"{step:,.0f}" for step in steps) + " |", "|---" * (1 + len(steps)) + "|"]
     for method in shown:
-        cells = [_cell(rows.get((method, step)), len(tasks)) for step in steps]
+        cells = [_cell(rows.get((method, step)), len(tasks), mark=method not in quoted) for step in steps]
         lines.append(f"| {escape(method)}{' (quoted)' * (method in quoted)} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _cell(row, tasks: int) -> str:
-    """A value with its interval and seeds, or a dash."""
+def _all_quoted(returns: pd.DataFrame) -> set[str]:
+    """The methods of which all values are quoted."""
+    return set(returns["method"]) - set(returns[returns["kind"] != "quoted"]["method"])
+
+
+def _cell(row, tasks: int, *, mark: bool) -> str:
+    """A value with its interval and seeds, or a dash; a quote may be marked."""
     if row is None:
         return DASH
-    text = f"{'≈ ' * (row.kind == 'interpolated')}{row.mean:.0f}"
+    text = f"{'≈ ' * (row.kind == 'interpolated')}{row.mean:.0f}{' (quoted)' * (mark and row.kind == 'quoted')}"
     if not np.isnan(row.lower):
         text += f" [{row.lower:.0f}, {row.upper:.0f}]"
     if not np.isnan(row.seeds):

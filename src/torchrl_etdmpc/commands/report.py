@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Table = Any  # of pandas, which is imported where it is used
 REFERENCE = Path(__file__).resolve().parents[1] / "analysis" / "reference"
 DEFAULT_REFERENCES = tuple(REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget"))
+DEFAULT_POINTS = (REFERENCE / "points.csv",)
 DEFAULT_GRID_STEP = 100_000
 MOST_SECONDS = 1e9  # that a process can sleep
 MOST_POINTS = 1000  # of a grid: more take minutes, and evaluations are not that dense
@@ -83,7 +84,7 @@ def parse() -> argparse.Namespace:
     arguments = parser.parse_args()
     if arguments.points is None:
         theirs = arguments.reference is not parser.get_default("reference")
-        arguments.points = [] if theirs else [REFERENCE / "points.csv"]
+        arguments.points = [] if theirs else DEFAULT_POINTS
     if arguments.benchmark is not None:
         get_benchmark(arguments.benchmark)  # a wrong name ends here, also when watching
     if not arguments.out:  # of an unset variable of the shell, as below
@@ -213,7 +214,7 @@ def choose_benchmark(arguments: argparse.Namespace, runs: Table) -> Benchmark:
     return own_benchmark(own, max(reached(runs), 1))
 
 
-def report(arguments: argparse.Namespace, references: list[Table], points: Table) -> str:
+def report(arguments: argparse.Namespace, references: list[Table], points: list[Table]) -> str:
     """Writes the report; returns a line for the terminal."""
     import pandas as pd
 
@@ -224,12 +225,14 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         incomplete_runs,
         join_curves,
         mixed_settings,
+        no_points,
         write_report,
     )
 
     found, runs, experiments, lines = read(arguments)
+    found, experiments, left_out = only_of_benchmark(arguments, found, experiments)
     mixed = mixed_settings(found)
-    for line in [*lines, *mixed]:
+    for line in [*lines, *left_out, *mixed]:
         print(line, file=sys.stderr, flush=True)
     # A run that has just begun would make nothing of the comparison; it is named as unfinished.
     evaluated = runs["env_steps"].where(runs["return_mean"].notna())
@@ -249,16 +252,20 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
     changed = changed_tasks([run for run in found if run.task in tasks])
     shorter = {run.task for run in found if any(setting.startswith("episode_length") for setting in run.changed)}
     shorter &= set(tasks)
-    seeds, means, unused = [chosen], [], []
+    seeds, means, unused = [chosen], [], list(left_out)
     for file, table in zip(arguments.reference, references, strict=True):
         known = table[table["task"].isin(benchmark.tasks)]
-        if known.empty and file not in DEFAULT_REFERENCES:
-            names = ", ".join(dict.fromkeys(table["task"]))
-            unused.append(f"{file} has no curve on a task of {benchmark.name}, its tasks are {names}: left out")
-            print(unused[-1], file=sys.stderr, flush=True)
+        if file not in DEFAULT_REFERENCES:
+            unused += tasks_of_no_use(file, table, benchmark, "curve")
         (seeds if "return_mean" in table else means).append(known[~known["task"].isin(shorter)])
-    points = points[~points["task"].isin(shorter)]
-    refuse_clash(methods, [*means, *seeds[1:], points])
+    for file, table in zip(arguments.points, points, strict=True):
+        if file not in DEFAULT_POINTS:
+            unused += tasks_of_no_use(file, table, benchmark, "point")
+    for line in unused[len(left_out) :]:
+        print(line, file=sys.stderr, flush=True)
+    quoted = pd.concat(points or [no_points()], ignore_index=True)
+    quoted = quoted[~quoted["task"].isin(shorter)]
+    refuse_clash(methods, [*means, *seeds[1:], quoted])
     curves = join_curves(seeds)
     published = join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"])
     baselines = evaluated_methods(curves, published, tasks=tasks, budget=budget)
@@ -272,7 +279,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         budget=budget,
         grid_step=grid_step,
         start=arguments.grid_start or int(-(-first // grid_step) * grid_step),
-        points=points,
+        points=quoted,
         **choose_base(arguments, chosen, methods, experiments),
     )
     notes = [f"{line}." for line in (*unused, *mixed)]
@@ -286,7 +293,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         if plan.base and plan.base not in methods
     ]
     comparison = dataclasses.replace(comparison, notes=(*comparison.notes, *notes))
-    incomplete = [*lines, *incomplete_runs(found, experiments)]
+    incomplete = [*lines, *incomplete_runs(found, experiments, budget=budget)]
     make_folder(Path(arguments.out).expanduser())
     page = write_report(comparison, os.path.expanduser(arguments.out), vector=arguments.vector, incomplete=incomplete)
     count = chosen[["method", "task", "seed"]].drop_duplicates().shape[0]
@@ -300,6 +307,36 @@ def report(arguments: argparse.Namespace, references: list[Table], points: Table
         at = f", compared at {budget:,}, {which}{known}"
     at += missing(incomplete)
     return f"{counts}, up to {last:,.0f} env steps{at}; the report is {page}"
+
+
+def only_of_benchmark(
+    arguments: argparse.Namespace, runs: list[Run], experiments: list[Experiment]
+) -> tuple[list[Run], list[Experiment], list[str]]:
+    """The runs and what the experiments plan on the tasks of the benchmark that was asked for; a line on the others."""
+    from torchrl_etdmpc.analysis import get_benchmark
+
+    if not arguments.benchmark:
+        return runs, experiments, []
+    tasks = get_benchmark(arguments.benchmark).tasks
+    here = [run for run in runs if run.task in tasks]
+    others = ", ".join(dict.fromkeys(run.task for run in runs if run.task not in tasks))
+    if not here or not others:
+        return runs, experiments, []
+    own = {plan.root: tuple(task for task in plan.tasks if task in tasks) for plan in experiments}
+    plans = [dataclasses.replace(plan, tasks=own[plan.root]) for plan in experiments]
+    count = len(runs) - len(here)
+    return here, plans, [f"{count} run{'s' * (count > 1)} on {others}, not of {arguments.benchmark}: left out"]
+
+
+def tasks_of_no_use(file: Path | str, table: Table, benchmark: Benchmark, kind: str) -> list[str]:
+    """A line on a file's tasks that are in no benchmark and not among those compared, or on a file without any."""
+    from torchrl_etdmpc.analysis import BENCHMARKS
+
+    tasks = list(dict.fromkeys(table["task"]))
+    if not set(tasks) & set(benchmark.tasks):
+        return [f"{file} has no {kind} on a task of {benchmark.name}, its tasks are {', '.join(tasks)}: left out"]
+    unknown = [task for task in tasks if not any(task in known.tasks for known in (*BENCHMARKS.values(), benchmark))]
+    return [f"{file}: no benchmark has the task {', '.join(unknown)}: left out"] if unknown else []
 
 
 def changed_tasks(runs: list[Run]) -> dict[str, str]:
@@ -365,11 +402,14 @@ def choose_base(
 
 
 def stamp(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
-    """Changes when an evaluation is added, or a run appears or is finished."""
-    from torchrl_etdmpc.analysis import find_runs
+    """Changes when an evaluation is added, a run appears or is finished, or what a run or an experiment is changes."""
+    from torchrl_etdmpc.analysis import experiment_root, find_runs
+    from torchrl_etdmpc.analysis.experiment import EXPERIMENT
 
-    runs = [RunDirectory(run) for run in find_runs(path for _, path in map(named, arguments.runs))]
-    files = [file for run in runs for file in (run.eval, run.summary) if file.exists()]
+    folders = find_runs(path for _, path in map(named, arguments.runs))
+    runs, roots = [*map(RunDirectory, folders)], dict.fromkeys(filter(None, map(experiment_root, folders)))
+    files = [file for run in runs for file in (run.eval, run.summary, run.config)]
+    files = [file for file in (*files, *(root / EXPERIMENT for root in roots)) if file.exists()]
     return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 
 
@@ -377,12 +417,10 @@ def main() -> None:
     """Writes the report, once or again and again."""
     try:
         arguments = parse()
-        import pandas as pd
-
-        from torchrl_etdmpc.analysis import no_points, read_curves, read_points
+        from torchrl_etdmpc.analysis import read_curves, read_points
 
         references = [read_curves(file) for file in arguments.reference]
-        points = pd.concat([read_points(file) for file in arguments.points] or [no_points()], ignore_index=True)
+        points = [read_points(file) for file in arguments.points]
         if arguments.watch is None:
             print(report(arguments, references, points))
             return
