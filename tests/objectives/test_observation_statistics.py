@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import operator
 
 import pytest
 import torch
@@ -40,6 +41,18 @@ def test_a_loss_in_evaluation_mode_leaves_the_statistics_alone(make_normalising_
     loss.eval()(make_slices())
     after = loss.world_model.encoder.norm.state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+@pytest.mark.parametrize("frozen", ["world_model.encoder", "encoder_params"])
+def test_a_frozen_encoder_keeps_its_statistics_until_it_is_thawed(make_normalising_loss, make_slices, frozen):
+    loss = make_normalising_loss()
+    norm, part = loss.world_model.encoder.norm, operator.attrgetter(frozen)(loss)
+    part.requires_grad_(False)
+    loss(make_slices())
+    assert norm.batches == 0
+    loss.world_model.encoder.requires_grad_(True)
+    loss(make_slices())
+    assert norm.batches == 1
 
 
 def test_the_policys_loss_alone_trains_no_encoder_and_moves_no_statistics(make_world_model, make_loss, make_slices):

@@ -191,6 +191,38 @@ def test_flags_are_neither_read_nor_needed_without_a_termination_head(make_loss,
     assert "loss_termination" not in expected.keys()
 
 
+@pytest.mark.parametrize("name", ["terminated", "done"])
+def test_flags_in_another_place_than_the_loss_looks_are_named(make_loss, slices, name):
+    loss = make_loss("model", ignore_termination=False)
+    flags = slices["next"].pop("terminated").zero_()
+    slices["next"].pop("done", None)
+    loss(slices.clone())
+    slices["next", "agent", name] = flags
+    there = rf"\('next', 'agent', '{name}'\)"
+    message = rf"\('next', '{name}'\) is not in the batch, but {there} is; name it: loss.set_keys\({name}="
+    with pytest.raises(ValueError, match=message):
+        loss(slices)
+    loss.set_keys(**{name: ("agent", name)})
+    loss(slices)
+    slices["next", "agent", name][:, 0] = True
+    with pytest.raises(ValueError, match=rf"{there} (holds True|is True before the last step)"):
+        loss(slices)
+
+
+@pytest.mark.parametrize("where", ["done", "last"])
+def test_a_next_observation_that_is_missing_at_the_end_of_a_slice_is_refused(make_loss, slices, where):
+    loss = make_loss("model")
+    slices["next", "observation"][1, -1] = float("nan")
+    slices["next", "done"] = torch.zeros_like(slices["next", "terminated"])
+    slices["next", "done"][1, -1] = where == "done"
+    message = "where .* is True: .*auto_reset" if where == "done" else "at the last step of a slice: .*compact_obs=True"
+    with pytest.raises(ValueError, match=message):
+        loss(slices)
+    slices["collector", "mask"] = torch.ones(slices.shape, dtype=torch.bool)
+    slices["collector", "mask"][1, -1] = False
+    loss(slices)
+
+
 def test_a_termination_head_needs_the_flags(make_world_model, make_loss, slices):
     del slices["next", "terminated"]
     with pytest.raises(KeyError, match="EfficientTDMPCModelLoss needs the key .*terminated.*set_keys"):

@@ -48,6 +48,17 @@ def test_noise_that_is_added_to_an_action_in_place_does_not_move_the_target(make
     assert torch.equal(out["plan", "loc"], target)
 
 
+@pytest.mark.parametrize("explore", [True, False])
+@pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+def test_a_planner_that_was_told_whether_to_explore_asks_nobody(make_planner, states, kind, explore):
+    """The exploration type is one for all threads of a process, and a loss beside sets it."""
+    planner = make_planner()
+    planner.explore = explore
+    with set_exploration_type(kind):
+        out = copy.deepcopy(planner)(TensorDict({"observation": states(3)}, [3]))
+    assert torch.equal(out["action"], out["plan", "loc"]) != explore
+
+
 def test_a_copy_plans_with_weights_of_its_own(make_planner, states, assert_same_plan):
     planner, observation = make_planner(), states(3)
     noise = planner.draw_noise(3)

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer
+from torchrl.data import Binary, Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import (
     ActionScaling,
     Compose,
+    EnvBase,
     GymEnv,
     InitTracker,
     RenameTransform,
@@ -48,6 +50,62 @@ def test_transforms_that_come_after_the_primer_may_mend_the_environment():
     planner = make_planner(env)
     env = TransformedEnv(env.base_env, Compose(InitTracker(), planner.make_tensordict_primer(), ActionScaling()))
     assert env.reset()["plan_mean"].shape == (2, 2)
+
+
+class Nested(EnvBase):
+    """Episodes of three steps, of which everything, ends included, stands below "agent"."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_spec = Composite(agent=Composite(observation=Unbounded(3)))
+        self.action_spec = Composite(agent=Composite(action=Bounded(-1, 1, shape=(1,), dtype=torch.float32)))
+        self.reward_spec = Composite(agent=Composite(reward=Unbounded(1)))
+        ends = {name: Binary(1, dtype=torch.bool) for name in ("done", "terminated")}
+        self.full_done_spec = Composite(agent=Composite(ends))
+
+    def _reset(self, tensordict: TensorDict | None = None, **kwargs) -> TensorDict:
+        self.steps = 0
+        return self._step(None)
+
+    def _step(self, tensordict: TensorDict | None) -> TensorDict:
+        self.steps += tensordict is not None
+        end = torch.tensor([self.steps == 3])
+        page = {"observation": torch.randn(3), "done": end, "terminated": end.clone()}
+        if tensordict is not None:
+            page["reward"] = torch.zeros(1)
+        return TensorDict({"agent": page})
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+def test_where_episodes_end_in_a_nested_place_the_plan_begins_there():
+    """TorchRL drops what a transform adds at a reset above that place."""
+    keys = {"observation_key": ("agent", "observation"), "action_key": ("agent", "action")}
+    planner = make_planner(None, observation_dim=3, action_dim=1, **keys)
+    env = TransformedEnv(Nested(), Compose(InitTracker(), planner.make_tensordict_primer()))
+    told = r"plan_mean_key=\('agent', 'plan_mean'\) and is_init_key=\('agent', 'is_init'\)"
+    with pytest.raises(ValueError, match=rf"episodes end at \('agent', 'done'\), and TorchRL would carry .*{told}"):
+        env.reset()
+    keys |= {"plan_mean_key": ("agent", "plan_mean"), "is_init_key": ("agent", "is_init")}
+    planner = make_planner(None, observation_dim=3, action_dim=1, **keys)
+    env = TransformedEnv(Nested(), Compose(InitTracker(), planner.make_tensordict_primer()))
+    steps = env.rollout(9, planner, break_when_any_done=False)
+    expected = torch.cat([torch.zeros(1, 2, 1), steps["next", "agent", "plan_mean"][:-1]])
+    assert expected[::3].any()
+    expected[::3] = 0
+    assert torch.equal(steps["agent", "plan_mean"], expected)
+
+
+@pytest.mark.parametrize("states", [1, 2, 5])  # as many as the plan has steps, fewer and more
+def test_an_environment_of_any_batch_size_gets_a_plan_for_each_state(states):
+    model = WorldModel(3, 1, latent_dim=16, mlp_dim=16, encoder_dim=16)
+    planner = EnsembleMPPIPlanner(LatentEnv(model), **BUDGET)
+    env = TransformedEnv(LatentEnv(model), planner.make_tensordict_primer())
+    start = env.reset(TensorDict({"latent": model.encode(torch.randn(states, 3))}, [states]))
+    assert torch.equal(start["plan_mean"], torch.zeros(states, 2, 1))
+    steps = env.rollout(3, planner, tensordict=start, auto_reset=False)
+    assert torch.equal(steps["plan_mean"][:, 1:], steps["next", "plan_mean"][:, :-1])
 
 
 @pytest.mark.parametrize("warm_start", [True, False])

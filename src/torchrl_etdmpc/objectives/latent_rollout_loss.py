@@ -337,6 +337,14 @@ class LatentRolloutLoss(SharedNetworksLoss):
         self._clear_weakrefs(tensordict, out)
         return out
 
+    @property
+    def _trains_the_encoder(self) -> bool:
+        """Not in evaluation, and not if it is frozen."""
+        if not self.training or "encoder_params" not in self._modules:
+            return False
+        trained = [parameter.requires_grad for parameter in self.world_model.encoder.parameters()]
+        return not trained or any(trained)
+
     def _parameters_without_a_term(self) -> list[nn.Parameter]:
         """Of the networks that only terms train which are not active."""
         active = {name for term in self.active_terms for name in (term.name, *term.networks)}
@@ -357,7 +365,7 @@ class LatentRolloutLoss(SharedNetworksLoss):
             dict: ``loss_*`` terms weighted by their coefficients, and detached metrics; with weights also the
             priorities ``[B, T]``, which :meth:`write_priority` takes out.
         """
-        if self.training and "encoder_params" in self._modules:  # who trains an encoder moves its statistics, too
+        if self._trains_the_encoder:  # and moves its statistics, too
             observe = getattr(self.world_model.encoder, "observe", None)
             if observe is not None:
                 counts = None if slices.counts is None else slices.counts[0]

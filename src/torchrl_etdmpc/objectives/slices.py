@@ -109,7 +109,7 @@ class SliceReader:
             harmless["plan_scale"] = torch.ones_like
             repeated = _Repeated(counts)
             entries = {name: _where(counts, entry, harmless.get(name, repeated)) for name, entry in entries.items()}
-        self._refuse_unknown_ends(tensordict, counts, entries["next_observation"], keys["next_observation"])
+        self._refuse_unknown_ends(tensordict, counts, entries, keys["next_observation"])
         self._warn_of_range(entries["action"], keys["action"])
         self._warn_of_holes(entries, counts, keys)
         entries = {name: entry.transpose(0, 1) for name, entry in entries.items()}
@@ -199,6 +199,8 @@ class SliceReader:
         if self.terminated_key is None or torch.compiler.is_compiling():
             return
         terminated = tensordict.get(self.terminated_key, None)
+        if terminated is None:
+            _refuse_elsewhere(tensordict, self.terminated_key, "terminated")
         if terminated is None or terminated.device.type != "cpu":
             return
         if counts is not None:
@@ -222,6 +224,8 @@ class SliceReader:
                 "targets."
             )
         done = tensordict.get(self.done_key, None)
+        if done is None:
+            _refuse_elsewhere(tensordict, self.done_key, "done")
         if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
             return
         inside = done.reshape(shape)[:, :-1].bool()
@@ -232,23 +236,24 @@ class SliceReader:
             )
 
     def _refuse_unknown_ends(
-        self, tensordict: TensorDictBase, counts: Tensor | None, following: Any, key: NestedKey
+        self, tensordict: TensorDictBase, counts: Tensor | None, entries: Mapping[str, Any], key: NestedKey
     ) -> None:
-        """An episode's last observation is learned like all others, so it must be there."""
-        done = tensordict.get(self.done_key, None)
-        if torch.compiler.is_compiling() or done is None or done.device.type != "cpu":
+        """An episode's last observation, and a slice's, is learned like all others, so it must be there."""
+        if torch.compiler.is_compiling() or entries["action"].device.type != "cpu":
             return
-        shape = following.shape[:2]
-        if done.numel() != shape.numel():
-            return
-        ends = done.reshape(shape).bool()
-        ends = ends if counts is None else ends & counts
-        if ends.any() and not _all_finite(following, ends):
-            raise ValueError(
-                f"{key!r} is not finite where {self.done_key!r} is True: an environment with auto_reset=True has lost "
-                "the last observations of its episodes; collect without auto_reset, or mask these steps "
-                "(loss_mask_key)."
-            )
+        done, shape = tensordict.get(self.done_key, None), entries["action"].shape[:2]
+        ends = torch.zeros(shape, dtype=torch.bool)
+        if done is not None and done.numel() == shape.numel():
+            ends |= done.reshape(shape).bool()
+        last = ends | (torch.arange(shape[1]) == shape[1] - 1)
+        for what, rows in ((f"where {self.done_key!r} is True", ends), ("at the last step of a slice", last)):
+            rows = rows if counts is None else rows & counts
+            if rows.any() and not _all_finite(entries["next_observation"], rows):
+                raise ValueError(
+                    f"{key!r} is not finite {what}: an environment with auto_reset=True has lost the last observations "
+                    "of its episodes, and compact_obs=True with NextStateReconstructor those of slices; collect "
+                    "without it, or mask these steps (loss_mask_key)."
+                )
 
     def _warn_of_range(self, action: Tensor, key: NestedKey) -> None:
         if not torch.compiler.is_compiling() and action.device.type == "cpu" and action.abs().max() > 1.001:
@@ -273,6 +278,18 @@ class SliceReader:
                 "them. Where an augmentation makes the two differ, ignore this.",
                 stacklevel=4,
             )
+
+
+def _refuse_elsewhere(tensordict: TensorDictBase, key: NestedKey, name: str) -> None:
+    """What is looked for under one key may stand under another, below ``"next"``, and would be taken to be missing."""
+    following = tensordict.get(NEXT, None)
+    if following is None:
+        return
+    others = [other for other in following.keys(True, True) if isinstance(other, tuple) and other[-1] == name]
+    if others:
+        raise ValueError(
+            f"{key!r} is not in the batch, but {(NEXT, *others[0])!r} is; name it: loss.set_keys({name}={others[0]!r})."
+        )
 
 
 def _all_finite(entry: Any, rows: Tensor) -> bool:

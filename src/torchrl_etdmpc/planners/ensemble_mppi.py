@@ -119,6 +119,9 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         plan_key (NestedKey): root of the target: ``loc``, ``scale``, ``value``, ``version`` and ``fallback`` below it.
 
     Attributes:
+        explore (bool, optional): whether ``forward`` explores, whatever the exploration type is. To be set where other
+            threads of the process call losses or evaluate: that type is one for all of them, and a loss changes it for
+            as long as it is called. Default: ``None``, the exploration type decides.
         compiled_plan (callable, optional): what ``forward`` calls in the place of :meth:`plan` if it is set, e.g.
             ``torch.compile(planner.plan)``; ``plan`` itself is never replaced. It belongs to this object: a copy of the
             planner starts without one. Default: ``None``.
@@ -207,6 +210,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.initial: InitialPlan = initial
         self.scoring_dtype = floating_dtype(scoring_dtype)
         self.proposal_log_std_bounds = both_or_none(proposal_log_std_min, proposal_log_std_max)
+        self.explore: bool | None = None
         self.compiled_plan: Callable[..., Plan] | None = None
         vars(self)["_imagination"] = _Imagination(env.world_model)
         self.observation_key, self.action_key = unravel_key(observation_key), unravel_key(action_key)
@@ -356,7 +360,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 f"the planner found both {self.observation_key!r} and {self.latent_key!r} in its input and cannot tell "
                 "which one is current; exclude one of them, or pass latent_key=None to plan from observations only."
             )
-        explore = exploration_type() is ExplorationType.RANDOM
+        explore = exploration_type() is ExplorationType.RANDOM if self.explore is None else self.explore
         carried, carry = self._read_warm_start(tensordict)
         make_plan = self.plan if self.compiled_plan is None else self.compiled_plan
         drawn: dict[str, Any] = {}

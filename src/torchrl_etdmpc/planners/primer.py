@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.envs import EnvBase, TensorDictPrimer
 
 from torchrl_etdmpc.envs.check import check_spaces
+from torchrl_etdmpc.keys import IS_INIT
 
 
 class PlanPrimer(TensorDictPrimer):
@@ -49,9 +51,33 @@ class PlanPrimer(TensorDictPrimer):
         if unravel_key(spaces["action_key"]) not in env.action_keys and not alone:
             spaces["action_dim"] = None
         check_spaces(env, **spaces)
+        self._check_resets(env)
+
+    def _check_resets(self, env: EnvBase) -> None:
+        """At a reset TorchRL keeps new entries only below a place where episodes end."""
+        places = [_path(key)[:-1] for key in env.reset_keys]
+        for key in self.primers.keys(True, True):
+            if not any(_path(key)[: len(place)] == place for place in places):
+                inner = (*places[0], _path(key)[-1])
+                raise ValueError(
+                    f"the environment's episodes end at {env.done_keys[0]!r}, and TorchRL would carry {key!r} from one "
+                    f"to the next; make the planner with plan_mean_key={inner!r} and is_init_key="
+                    f"{(*places[0], IS_INIT)!r}."
+                )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if not self._checked and self.container is not None:
             self.check(self.container, alone=False)
             self._checked = True
-        return super()._reset(tensordict, tensordict_reset)
+        if self.parent is None or self.parent.batch_locked:
+            return super()._reset(tensordict, tensordict_reset)
+        for key, spec in self.primers.items(
+            True, True
+        ):  # TorchRL's are of one state; where none begins they are dropped
+            shape = (*tensordict_reset.batch_size, *spec.shape[-2:])
+            tensordict_reset.set(key, torch.zeros(shape, device=spec.device, dtype=spec.dtype))
+        return tensordict_reset
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    return key if isinstance(key, tuple) else (key,)
