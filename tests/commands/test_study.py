@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 
 from torchrl_etdmpc import commands  # noqa: E402
+from torchrl_etdmpc.commands import study as study_command  # noqa: E402
 from torchrl_etdmpc.commands.study import StudyName  # noqa: E402
 from torchrl_etdmpc.inspector import Simulator, play_episode  # noqa: E402
 from torchrl_etdmpc.inspector.studies import advantage, choose_states  # noqa: E402
@@ -102,6 +104,27 @@ def test_a_study_is_what_its_function_returns_and_follows_from_the_seed(tmp_path
     lines = out.splitlines()
     assert lines[0].startswith("cartpole-balance, trained for 400 env steps: 2 episodes, return ")
     assert lines[1:] == ["advantage: here/advantage.png", *(f"  {line}" for line in advantage.lines(result))]
+
+
+def test_a_study_names_the_file_that_it_loaded_and_what_was_changed_of_the_task(
+    tmp_path, checkpoint, study, monkeypatch
+):
+    """A run that goes on writes its files anew while the episodes are played."""
+    own = tmp_path / "last.pt"
+    own.write_bytes(checkpoint.read_bytes())
+    play = study_command.play_episode
+
+    def play_and_replace(*arguments, **options):
+        own.write_bytes(b"newer")
+        return play(*arguments, **options)
+
+    monkeypatch.setattr(study_command, "play_episode", play_and_replace)
+    message, out, _ = study("consistency", f"checkpoint={own}", "task.episode_length=40", "out=here", *FEW)
+    assert message is None
+    about = json.loads((tmp_path / "here" / "consistency.json").read_text(encoding="utf-8"))
+    assert about["checkpoint_sha256"] == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+    assert about["changed_task"] == {"episode_length": 40}
+    assert out.startswith("cartpole-balance with episode_length=40, trained for 400 env steps: ")
 
 
 def test_the_name_may_be_written_as_a_setting(tmp_path, checkpoint, study):

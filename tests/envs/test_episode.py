@@ -201,6 +201,30 @@ def test_what_is_registered_as_nondeterministic_cannot_be_restored():
 
 
 @needs_gym
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_simulator_whose_rewards_are_drawn_by_chance_is_not_brought_back(noise):
+    """The place is reached exactly; what was paid on the way there is not."""
+    import gymnasium
+
+    class Paid(gymnasium.Wrapper):
+        def step(self, action):
+            observation, reward, *flags = self.env.step(action)
+            return observation, reward + noise * np.random.normal(), *flags
+
+    pendulum = gymnasium.registry["Pendulum-v1"]
+    gymnasium.register("Paid-v0", lambda **kwargs: Paid(pendulum.make(**kwargs).unwrapped), max_episode_steps=9)
+    try:
+        env = make_any_env("gym/Paid-v0", seed=1)
+        env.rollout(3)
+        state = through_a_file(simulator_state(env))
+        assert load_simulator_state(make_any_env("gym/Paid-v0", seed=1), state) == (noise == 0)
+        del state["_extra_state"]["episode_reward"]  # as versions before kept it
+        assert load_simulator_state(make_any_env("gym/Paid-v0", seed=1), state)
+    finally:
+        del gymnasium.registry["Paid-v0"]
+
+
+@needs_gym
 def test_a_reset_with_options_cannot_be_repeated_and_the_next_one_can():
     env = make_any_env("gym/Pendulum-v1")
     env.reset(options={"x_init": 0.1, "y_init": 0.1})

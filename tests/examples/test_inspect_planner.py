@@ -84,6 +84,7 @@ def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, save_untrained
     assert trace["observation"].tolist() == rows["observation"][7].tolist()
     message, _, _ = run_main(f"checkpoint={checkpoint}", "state=replay:12", "save=other")
     assert message == "error: the row must be in [0, 12), the rows of the replay buffer, got 12."
+    assert not (tmp_path / "other").exists()
     row_of = f"a row of {PENDULUM}, on which the agent was trained, and none of walker-walk;"
     message, _, _ = run_main(f"checkpoint={checkpoint}", "state=replay:7", "task=walker-walk", "save=third")
     assert message is not None and message.startswith(f"error: state=replay:7 is {row_of} leave task=... out, or")

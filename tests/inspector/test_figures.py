@@ -7,6 +7,7 @@ import torch
 from torchrl_etdmpc.inspector import Trace, add_simulation, figures, trace_plan
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv
+from torchrl_etdmpc.testing import LineWorld
 
 pytest.importorskip("plotly")
 
@@ -115,6 +116,26 @@ def test_mixture_weights_are_the_elites_mean_or_the_candidate_s(trace):
     assert np.allclose(rows.sum(1), 1, atol=1e-5)
     assert np.array_equal(figures.mixture_weights(trace, 5).data[0].z, trace["mixture"][:, 5])
     assert not figures.mixture_weights(make()).data
+
+
+def test_elites_without_a_finite_score_count_in_no_mean():
+    """The planner gives them no weight; the mixture of returns that are NaN would be all of depth 1."""
+
+    class Diverging(LineWorld):
+        def next(self, latent, action):
+            return torch.where(action[..., :1] > 0.9, torch.nan, super().next(latent, action))
+
+    budget = {"horizon": 3, "num_samples": 16, "num_elites": 12, "num_proposals": 2, "iterations": 2}
+    planner = EnsembleMPPIPlanner(LatentEnv(Diverging(num_dynamics=2)), score="adaptive", beta=1.0, **budget)
+    trace = trace_plan(planner, torch.tensor([0.5]))
+    scores = trace["scores"][0]
+    finite = [index for index in trace["elites"][0] if np.isfinite(scores[index])]
+    assert 0 < len(finite) < len(trace["elites"][0])
+    assert np.isnan(trace["mixture"][0][~np.isfinite(scores)]).all()
+    row = figures.mixture_weights(trace).data[0].z[0]
+    np.testing.assert_allclose(row, trace["mixture"][0][finite].mean(0), rtol=1e-6)
+    (elites,) = [line.y for line in figures.disagreement(trace, 0).data if line.name == "elites" and line.xaxis == "x"]
+    np.testing.assert_allclose(elites, trace["returns"][0][finite].std((-2, -1)).mean(0), rtol=1e-5)
 
 
 def test_disagreement_is_the_spread_over_heads_by_depth(trace):

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,17 @@ def test_frames_are_pictures_in_the_page(tmp_path):
     page = write_page(tmp_path / "page", make(), strip=Strip([0, 7], [frame, frame]), step=7)
     assert page.read_text().count(picture(frame)) == 2
     assert 'class="here"><img alt="step 7"' in page.read_text()
+
+
+def test_what_a_simulator_paid_stands_alone_where_no_reward_was_predicted(tmp_path):
+    """Of TorchRL's planners, whose models are environments."""
+    arrays = {name: array for name, array in make().arrays.items() if not name.startswith("chosen_rewards")}
+    frames = np.zeros((3, 4, 4, 3), np.uint8)
+    real = {"frames": frames, "real_rewards": np.array([0.25, 0.5], np.float32)}
+    page = write_page(tmp_path / "page", replace(make(), arrays=arrays | real)).read_text()
+    assert "step 2: 0.50" in page and ", predicted" not in page
+    both = write_page(tmp_path / "both", replace(make(), arrays=make().arrays | real)).read_text()
+    assert re.search(r"step 2: 0.50, predicted -?\d", both)
 
 
 def test_the_frame_nearest_to_the_state_is_marked(tmp_path):

@@ -59,6 +59,16 @@ def test_a_trace_holds_the_planner_s_own_numbers(make):
     assert trace.manifest["task"] == "line"
 
 
+def test_where_mppi_s_weights_overflow_the_trace_has_its_nan():
+    planner = mppi()
+    planner.temperature = torch.tensor(1e4)
+    trace = trace_torchrl_planner(planner, STATE, seed=3)
+    torch.manual_seed(3)
+    assert planner.planning(STATE[None]).isnan().all()
+    assert np.isfinite(trace["scores"][0]).all()
+    assert np.isnan(trace["mean"][0]).all() and np.isnan(trace["elite_weights"][0]).any()
+
+
 def test_cem_s_scores_are_the_imagined_rewards():
     trace = trace_torchrl_planner(cem(), STATE)
     places = STATE["x"].numpy() + 0.5 * trace["actions"].cumsum(2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import re
 from dataclasses import dataclass
@@ -66,6 +67,7 @@ def main(config: InspectConfig) -> None:
     if config.save is not None:
         free_folder(config.save)
     inspection = _inspection(config)
+    made = config.save is not None and not Path(config.save).expanduser().exists()
     try:
         if config.save is not None:
             make_folder(free_folder(config.save))
@@ -78,6 +80,11 @@ def main(config: InspectConfig) -> None:
             strip = None if state.replay else inspection.strip(state.episode)
             page = write_page(config.save, trace, strip=strip, step=state.step)
             print(f"{inspection.task.name if inspection.task else 'agent'}: {page}, which any browser opens")
+    except BaseException:
+        if made:
+            with contextlib.suppress(OSError):  # it was not made, or holds a page
+                Path(config.save).expanduser().rmdir()
+        raise
     finally:
         inspection.close()
 
@@ -97,6 +104,7 @@ def _inspection(config: InspectConfig) -> Inspection:
     agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off", **sizes)
     path = Path(config.checkpoint).expanduser()
     about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
+    changed = {"changed_task": config.changed_task} if config.changed_task else {}
     store = CheckpointStore(path.parent)
     try:
         rows = 0 if elsewhere else store.buffer_rows()
@@ -109,7 +117,7 @@ def _inspection(config: InspectConfig) -> Inspection:
         steps=config.steps,
         replay=(lambda row: store.read_row(row)["observation"]) if rows else None,
         rows=rows,
-        about={"checkpoint": about},
+        about={"checkpoint": about} | changed,
     )
 
 

@@ -84,6 +84,7 @@ def _main(config: StudyConfig) -> None:
     env = make_env(task, seed=config.seed)
     agent, _, counters = load_agent(config.checkpoint, **env_sizes(env), device=device, compile_setting="off")
     env.close(raise_if_closed=False)
+    digest, changed = checksum(config.checkpoint), config.changed_task  # now: a run that goes on replaces the file
     folder = Path(config.out).expanduser()
     make_folder(folder)
     episodes: list[Episode] = []
@@ -94,8 +95,9 @@ def _main(config: StudyConfig) -> None:
     returns = torch.stack([episode.reward.sum() for episode in episodes])
     about = {
         "task": task.name,
+        "changed_task": changed,
         "checkpoint": config.checkpoint,
-        "checkpoint_sha256": checksum(config.checkpoint),
+        "checkpoint_sha256": digest,
         "trained_env_steps": counters.get("env_steps"),
         "episodes": config.episodes,
         "mean_return": returns.mean().item(),
@@ -106,8 +108,9 @@ def _main(config: StudyConfig) -> None:
         "threads": torch.get_num_threads(),
         "versions": library_versions(),
     }
+    settings = f" with {', '.join(f'{name}={value}' for name, value in changed.items())}" if changed else ""
     print(
-        f"{task.name}, trained for {counters.get('env_steps', 'an unknown number of')} env steps: "
+        f"{task.name}{settings}, trained for {counters.get('env_steps', 'an unknown number of')} env steps: "
         f"{config.episodes} episodes, return {returns.mean():.1f}"
     )
     if config.episodes == 1:
@@ -149,7 +152,7 @@ def _study(
         "value_bias": max(decisions // 2, 1),  # so that what the time limit cut off weighs little
         "advantage": window,
     }
-    limit = config.task_spec.decision_steps_per_episode
+    limit = simulator.task.decision_steps_per_episode
     states = choose_states(episodes, config.states, ahead=ahead.get(name, 1), limit=limit, seed=config.seed)
     study = getattr(module, name)
     if name == "value_bias":

@@ -22,6 +22,7 @@ from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
 __all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
 
 _TRANSFORMS = "transforms"
+_PAID = "episode_reward"
 """Where a state has what the transforms around the simulator remember, by their place."""
 
 
@@ -112,13 +113,17 @@ class RecordedEnv(EnvBase):
         return observation, reward, terminated, truncated
 
     def get_extra_state(self) -> dict[str, Tensor] | None:
-        """Random state before the reset, the actions since, and a fingerprint of the place that they led to."""
+        """Random state before the reset, the actions since, and what tells the place and the rewards they led to.
+
+        The rewards so far are kept as bits: they may be drawn by chance where the place is not.
+        """
         if self._random is None:
             return None
         return {
             "random": self._random,
             "actions": torch.from_numpy(np.array(self._actions).reshape(-1, *self.action_spec.shape)),
             "fingerprint": torch.from_numpy(np.array(self._fingerprint())),
+            _PAID: self._episode_reward.view(torch.int32),
         }
 
     def set_extra_state(self, state: dict[str, Tensor] | None) -> None:
@@ -227,7 +232,14 @@ def load_simulator_state(env: EnvBase, state: dict[str, Any] | None) -> bool:
         load_transform_states(env, state.get(_TRANSFORMS, {}))
     except (RuntimeError, LookupError):  # made in another way than the one that was saved
         return False
-    return equal_states(simulator_state(env), state)
+    return equal_states(_as_old_as(state, simulator_state(env)), state)
+
+
+def _as_old_as(saved: Any, now: Any) -> Any:
+    """The state of now without what the version that saved the other one did not keep."""
+    if not isinstance(saved, dict) or not isinstance(now, dict):
+        return now
+    return {name: _as_old_as(saved.get(name), part) for name, part in now.items() if name in saved or name != _PAID}
 
 
 def transform_states(env: EnvBase) -> dict[str, Any]:

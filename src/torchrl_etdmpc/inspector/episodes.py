@@ -194,8 +194,8 @@ class Simulator:
         return self._keep(env, wanted)
 
     def _keep(self, env: RecordedEnv, wanted: dict[str, Tensor]) -> tuple[Tensor, bool]:
-        fingerprint = (env.get_extra_state() or {}).get("fingerprint")
-        if fingerprint is None or not torch.equal(fingerprint, wanted["fingerprint"]):
+        now = env.get_extra_state() or {}
+        if not now.keys() >= wanted.keys() or not all(torch.equal(now[name], wanted[name]) for name in wanted):
             self._place = None
             raise ValueError(_not_exact(self.task.name))
         lead_back = env.bookmark()

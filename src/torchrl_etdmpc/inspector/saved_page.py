@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import itertools
 import json
 import struct
 import zlib
@@ -143,10 +144,10 @@ def frames_of(trace: Trace) -> list[tuple[str, str]]:
     frames, rewards = trace.get("frames"), trace.get("real_rewards")
     if frames is None or rewards is None:
         return []
-    predicted = trace["chosen_rewards"].mean(1)
-    texts = ["now"]
-    for step, (real, imagined) in enumerate(zip(rewards, predicted, strict=False), 1):
-        texts.append(f"step {step}: {real:.2f}, predicted {imagined:.2f}")
+    imagined = trace.get("chosen_rewards")
+    predicted = [] if imagined is None else [f", predicted {value:.2f}" for value in imagined.mean(1)]
+    told = itertools.zip_longest(rewards, predicted[: len(rewards)], fillvalue="")
+    texts = ["now", *(f"step {step}: {real:.2f}{guess}" for step, (real, guess) in enumerate(told, 1))]
     return [(picture(frame), text) for frame, text in zip(frames, texts, strict=False)]
 
 

@@ -71,7 +71,9 @@ def trace_torchrl_planner(
     scores = torch.stack([_scores(planner, rolled) for _, rolled in recorder.seen])
     ranked, elites = scores.topk(planner.top_k, dim=-1)
     mppi = isinstance(planner, MPPIPlanner)
-    weights = (planner.temperature * ranked).softmax(-1) if mppi else torch.full_like(ranked, 1 / planner.top_k)
+    # As the planner has them, without a shift: where the exponential overflows, its plan is NaN.
+    weights = (planner.temperature * ranked).exp() if mppi else torch.ones_like(ranked)
+    weights = weights / weights.sum(-1, keepdim=True)
     best = actions.gather(1, elites[..., None, None].expand(-1, -1, *actions.shape[2:]))  # [I, K, H, A]
     mean = (weights[..., None, None] * best).sum(1)
     squares = (weights[..., None, None] * (best - mean[:, None]).square()).sum(1)

@@ -65,3 +65,9 @@ def test_first_decisions_are_left_out_and_states_without_plans_refused(world, ma
     for none in (states._replace(plan_mean=None), states._replace(step=torch.zeros_like(states.step))):
         with pytest.raises(ValueError, match="states must have plans before them, got none; play the episodes with"):
             consistency.consistency(planner, none)
+
+
+def test_a_planner_that_reads_no_plan_before_is_refused(world, make_episodes, make_planner):
+    states = choose_states(make_episodes(world, world.optimal_action, steps=4), 100)
+    with pytest.raises(ValueError, match="reads no plan before"):
+        consistency.consistency(make_planner(world, initial="policy"), states)

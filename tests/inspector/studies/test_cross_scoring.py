@@ -40,6 +40,13 @@ def test_all_estimates_agree_where_all_heads_are_exact(make_episodes, make_plann
     assert (result.gain[:, :, 2] > 0).all()  # half of the best action is not the best
 
 
+def test_an_agent_of_one_head_has_no_ensemble_to_compare_with(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=1, num_values=1)
+    states = choose_states(make_episodes(world, world.optimal_action), 2, ahead=3)
+    with pytest.raises(ValueError, match="a single head is the ensemble"):
+        cross_scoring.cross_scoring(make_planner(world), states, WorldSimulator(world), **BUDGET)
+
+
 def test_a_critic_whose_heads_are_drawn_is_refused(make_episodes):
     world = LineWorld()
     states = choose_states(make_episodes(world, world.optimal_action), 2, ahead=3)

@@ -37,6 +37,23 @@ def test_without_pessimism_the_best_depth_has_all_the_weight(make_episodes, make
     assert torch.equal(result.weights[:, :, -1], weights)
 
 
+def test_candidates_without_a_finite_score_have_no_weights(make_episodes, make_planner):
+    """The planner gives them none, however many of the elites they are."""
+
+    class Diverging(LineWorld):
+        def next(self, latent, action):
+            return torch.where(action[..., :1] > 0.9, torch.nan, super().next(latent, action))
+
+    world = LineWorld(goal=1.0, num_values=2, value_offset=[APART, -APART])
+    states = choose_states(make_episodes(world, world.optimal_action), 4)
+    planner = make_planner(
+        Diverging(goal=1.0, num_values=2, value_offset=[APART, -APART]), num_samples=64, num_elites=40, iterations=1
+    )
+    result = horizon_weights.horizon_weights(planner, states, betas=(1.0,), horizon=3)
+    assert torch.allclose(result.weights.sum(-1), torch.ones(4, 1, 1), atol=1e-5)
+    assert result.mean.isfinite().all()
+
+
 def test_the_table_names_every_weight_and_the_lines_the_mean_depth():
     weights = torch.tensor([[0.5, 0.5], [0.0, 1.0]]).expand(6, 1, 2, 2)  # two iterations of two depths
     result = horizon_weights.HorizonWeights(

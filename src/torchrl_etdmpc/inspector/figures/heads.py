@@ -63,7 +63,7 @@ def mixture_weights(trace: Trace, candidate: int | None = None) -> Drawing:
     if weights is None:
         return plain(empty)("depths have weights of their own with score=adaptive only")
     if candidate is None:
-        rows = np.take_along_axis(weights, trace["elites"][..., None], 1).mean(1)
+        rows = np.stack([_mean_of(of, elites) for of, elites in zip(weights, _finite_elites(trace), strict=True)])
     else:
         rows = weights[:, candidate]
     cells = {
@@ -110,14 +110,14 @@ def _of_returns(trace: Trace, iteration: int, candidate: int | None) -> list[tup
     if trace.get("returns") is None:
         return []
     returns = trace["returns"][iteration]
-    elites = returns[trace["elites"][iteration]]
-    lines = [("elites", elites.std((-2, -1)).mean(0)), ("all candidates", returns.std((-2, -1)).mean(0))]
+    spread = returns.std((-2, -1))
+    lines = [("elites", _mean_of(spread, _finite_elites(trace)[iteration])), ("all candidates", spread.mean(0))]
     if trace.get("chosen_returns") is not None:
         lines.append(("chosen", trace["chosen_returns"].std((-2, -1))))
     if trace.get("policy_returns") is not None:
         lines.append(("policy", trace["policy_returns"].std((-2, -1)).mean(0)))
     if candidate is not None:
-        lines.append(("clicked", returns[candidate].std((-2, -1))))
+        lines.append(("clicked", spread[candidate]))
     return lines
 
 
@@ -125,5 +125,17 @@ def _of_latents(trace: Trace, iteration: int, candidate: int | None) -> list[tup
     if trace.get("latent_spread") is None:
         return []
     spread = trace["latent_spread"][iteration]
-    lines = [("elites", spread[trace["elites"][iteration]].mean(0)), ("all candidates", spread.mean(0))]
+    lines = [("elites", _mean_of(spread, _finite_elites(trace)[iteration])), ("all candidates", spread.mean(0))]
     return lines if candidate is None else [*lines, ("clicked", spread[candidate])]
+
+
+def _finite_elites(trace: Trace) -> list[np.ndarray]:
+    """Indices of the elites that have a finite score, by iteration: the planner gives the others no weight."""
+    return [
+        elites[np.isfinite(scores[elites])] for elites, scores in zip(trace["elites"], trace["scores"], strict=True)
+    ]
+
+
+def _mean_of(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Of some rows ``[N, D]``, NaN without one."""
+    return values[rows].mean(0) if len(rows) else np.full(values.shape[1:], np.nan)

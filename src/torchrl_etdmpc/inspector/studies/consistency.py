@@ -41,8 +41,10 @@ def consistency(planner: EnsembleMPPIPlanner, states: States, *, seed: int = 0) 
         seed (int): of the plans.
 
     Raises:
-        ValueError: if the states have no plans before them.
+        ValueError: if the states have no plans before them, or the planner does not read them (``initial="policy"``).
     """
+    if planner.initial == "policy":
+        raise ValueError("the planner begins with its policy's plan (initial=policy) and reads no plan before.")
     if states.plan_mean is None or not (states.step > 0).any():
         raise ValueError(
             "states must have plans before them, got none; play the episodes with a planner that has warm_start=True."

@@ -73,13 +73,17 @@ def cross_scoring(
         seed (int): of the plans.
 
     Raises:
-        ValueError: if the critic also reads the action, as TD-MPC2's: there is no single head to plan by.
+        ValueError: if the critic also reads the action, as TD-MPC2's: there is no single head to plan by; or if there
+            is a single head only.
     """
     if has_action_values(planner.world_model):
         raise ValueError(
             f"critic must be of states, got {type(planner.world_model).__name__}, with which plans are made by two "
             "heads that are drawn anew in every iteration; take an agent whose critic reads the state alone."
         )
+    model = planner.world_model
+    if model.num_dynamics == model.values(model.encode(states.observation[:1])).shape[-1] == 1:
+        raise ValueError("the agent has one dynamics head and one value head, so that a single head is the ensemble.")
     budget = {"num_samples": num_samples, "num_elites": num_elites, "iterations": iterations, "extra_iterations": 0}
     proposals = num_proposals if planner.num_proposals else 0
     found = []

@@ -54,11 +54,13 @@ def horizon_weights(
         plan = replan(searcher, states.observation, generator=generator_of(planner, seed), trace=True)
         assert plan.trace is not None
         ranked = plan.trace.scores.where(plan.trace.scores.isfinite(), -torch.inf)
-        elites = ranked.topk(searcher.num_elites, dim=-1).indices[..., None]
+        best, elites = ranked.topk(searcher.num_elites, dim=-1)
+        finite, elites = best.isfinite()[..., None], elites[..., None]  # the planner gives the others no weight
         mean, sigma = ensemble_mean(plan.trace.returns), ensemble_std(plan.trace.returns)
         mean, sigma = (part.gather(2, elites.expand(-1, -1, -1, horizon)) for part in (mean, sigma))  # [S, I, K, H]
         _, weights = adaptive_mixture(mean, sigma, float(beta))
-        fields.append((weights.mean(2), mean[:, -1].mean(1), sigma[:, -1].mean(1)))
+        weights, mean, sigma = (part.where(finite, torch.nan).nanmean(2) for part in (weights, mean, sigma))
+        fields.append((weights, mean[:, -1], sigma[:, -1]))
     joined = (torch.stack(field, dim=1) for field in zip(*fields, strict=True))
     return HorizonWeights(*joined, betas=tuple(map(float, betas)), episode=states.episode)
 

@@ -102,7 +102,7 @@ def trace_plan(
     if isinstance(observation, Tensor) and observation.ndim == 1:
         tensors["observation"] = observation
     if isinstance(planner.score, AdaptiveScore):
-        tensors["mixture"] = _mixture(search.returns, planner.score.beta)
+        tensors["mixture"] = _mixture(search, planner.score.beta)
     if has_policy(model):
         tensors |= _of_the_policy(planner, latent)
         if chosen_actions is None:
@@ -176,9 +176,10 @@ def _chosen(
     return index, search.actions[-1, index]
 
 
-def _mixture(returns: Tensor, beta: float) -> Tensor:
-    """Weights ``[I, N, D]`` that the adaptive score gives the depths."""
-    return adaptive_mixture(ensemble_mean(returns), ensemble_std(returns), beta)[1]
+def _mixture(search: PlanTrace, beta: float) -> Tensor:
+    """Weights ``[I, N, D]`` that the adaptive score gives the depths; NaN where it has no finite value."""
+    weights = adaptive_mixture(ensemble_mean(search.returns), ensemble_std(search.returns), beta)[1]
+    return weights.where(search.scores.isfinite()[..., None], torch.nan)
 
 
 def _of_the_policy(planner: EnsembleMPPIPlanner, latent: Tensor) -> dict[str, Tensor]:

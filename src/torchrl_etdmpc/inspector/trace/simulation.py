@@ -38,7 +38,9 @@ def add_simulation(
     arrays = {**trace.arrays, "real_rewards": as_array(rewards)}
     if trace.get("basis") is not None:
         with torch.no_grad():
-            latents = as_array(model.encode(observations.to(_like(model))))
+            like = _like(model)
+            floating = observations.is_floating_point()  # others an encoder is given as they are
+            latents = as_array(model.encode(observations.to(like if floating else like.device)))
         arrays["real_points"] = ((latents - trace["centre"]) @ trace["basis"].T).astype(np.float32)
     if frames is not None:
         arrays["frames"] = as_array(frames)
