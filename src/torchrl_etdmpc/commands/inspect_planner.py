@@ -67,7 +67,8 @@ def main(config: InspectConfig) -> None:
     if config.save is not None:
         free_folder(config.save)
     inspection = _inspection(config)
-    made = config.save is not None and not Path(config.save).expanduser().exists()
+    folder = None if config.save is None else Path(config.save).expanduser()
+    made = folder is not None and not folder.exists()
     try:
         if config.save is not None:
             make_folder(free_folder(config.save))
@@ -81,9 +82,9 @@ def main(config: InspectConfig) -> None:
             page = write_page(config.save, trace, strip=strip, step=state.step)
             print(f"{inspection.task.name if inspection.task else 'agent'}: {page}, which any browser opens")
     except BaseException:
-        if made:
+        if made and folder is not None:
             with contextlib.suppress(OSError):  # it was not made, or holds a page
-                Path(config.save).expanduser().rmdir()
+                folder.rmdir()
         raise
     finally:
         inspection.close()

@@ -263,7 +263,7 @@ def report(arguments: argparse.Namespace, references: list[Table], points: list[
             unused += tasks_of_no_use(file, table, benchmark, "point")
     for line in unused[len(left_out) :]:
         print(line, file=sys.stderr, flush=True)
-    quoted = pd.concat(points or [no_points()], ignore_index=True)
+    quoted: Table = pd.concat(points or [no_points()], ignore_index=True)
     quoted = quoted[~quoted["task"].isin(shorter)]
     refuse_clash(methods, [*means, *seeds[1:], quoted])
     curves = join_curves(seeds)

@@ -236,7 +236,7 @@ class SliceReader:
             )
 
     def _refuse_unknown_ends(
-        self, tensordict: TensorDictBase, counts: Tensor | None, entries: Mapping[str, Any], key: NestedKey
+        self, tensordict: TensorDictBase, counts: Tensor | None, entries: Mapping[NestedKey, Any], key: NestedKey
     ) -> None:
         """An episode's last observation, and a slice's, is learned like all others, so it must be there."""
         if torch.compiler.is_compiling() or entries["action"].device.type != "cpu":

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, TensorDictPrimer
 
 from torchrl_etdmpc.envs.check import check_spaces
@@ -56,7 +57,7 @@ class PlanPrimer(TensorDictPrimer):
     def _check_resets(self, env: EnvBase) -> None:
         """At a reset TorchRL keeps new entries only below a place where episodes end."""
         places = [_path(key)[:-1] for key in env.reset_keys]
-        for key in self.primers.keys(True, True):
+        for key, _ in self._specs():
             if not any(_path(key)[: len(place)] == place for place in places):
                 inner = (*places[0], _path(key)[-1])
                 raise ValueError(
@@ -71,13 +72,15 @@ class PlanPrimer(TensorDictPrimer):
             self._checked = True
         if self.parent is None or self.parent.batch_locked:
             return super()._reset(tensordict, tensordict_reset)
-        for key, spec in self.primers.items(
-            True, True
-        ):  # TorchRL's are of one state; where none begins they are dropped
+        for key, spec in self._specs():  # TorchRL's zeros are of one state; where no episode begins they are dropped
             shape = (*tensordict_reset.batch_size, *spec.shape[-2:])
             tensordict_reset.set(key, torch.zeros(shape, device=spec.device, dtype=spec.dtype))
         return tensordict_reset
 
+    def _specs(self) -> list[tuple[NestedKey, TensorSpec]]:
+        primers: Any = self.primers  # its type says that there may be none
+        return list(primers.items(True, True))
 
-def _path(key: NestedKey) -> tuple[str, ...]:
+
+def _path(key: NestedKey) -> tuple[Any, ...]:
     return key if isinstance(key, tuple) else (key,)
