@@ -205,8 +205,9 @@ def test_an_area_is_of_the_seeds_whose_curves_cover_the_grid():
     areas = run(pd.concat([OURS, *runs]), start=50_000).areas
     assert cell(areas, "part", TASKS[0])[["auc", "seeds"]].tolist() == pytest.approx([0.15 * 100 / 800, 1])
     assert np.isnan(cell(areas, "part", TASKS[0])["standard_error"])
-    areas = run(pd.concat([OURS, early]), start=50_000).areas
-    assert np.isnan(cell(areas, "part", TASKS[0])["auc"])
+    late = seed_curves("part", lambda *_: 900.0, seeds=(3,), steps=STEPS[2:], tasks=TASKS[:1])
+    areas = run(pd.concat([OURS, early, late]), start=50_000).areas
+    assert np.isnan(cell(areas, "part", TASKS[0])["auc"])  # each covers a part of it
 
 
 def test_a_seed_of_the_normaliser_that_has_ended_at_the_benchmark_s_budget_does_not_count():

@@ -520,9 +520,8 @@ def test_a_method_with_a_curve_and_a_quote_has_one_column(run_main):
     page = Path("report", "index.md").read_text()
     heads = [line for line in page.splitlines() if line.startswith("| task |")]
     assert heads and all(line.count("theirs") <= 1 for line in heads)
-    assert "| cup-catch | 51 | 61 | 9 (quoted) |" in re.sub(r" \[[^]]*\] \(2\)| \(2\)", "", page).replace(
-        "52", "51"
-    ).replace("62", "61")
+    (row,) = [line for line in page.splitlines() if line.startswith("| cup-catch") and "quoted" in line]
+    assert row.endswith(" | 9 (quoted) |")
 
 
 def test_without_pandas_there_is_one_line(monkeypatch, refused):

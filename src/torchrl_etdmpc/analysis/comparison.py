@@ -254,11 +254,11 @@ def _areas(
     """
     areas = auc(normalise(interpolate(estimates, grid, from_zero=from_zero), constants))
     known = auc_of_seeds(normalise(seed_curves, constants), grid, from_zero=from_zero)
-    areas = areas.merge(known, on=["method", "task"], how="left", suffixes=("", "_of_seeds"))
+    areas = areas.merge(known, on=["method", "task"], how="left", suffixes=("", "_of_seeds"), indicator="source")
     if not from_zero:
-        whose = areas["seeds_of_seeds"].notna()
+        published = areas["source"] == "left_only"
         for name in ("auc", "seeds"):
-            areas[name] = areas[f"{name}_of_seeds"].where(whose, areas[name])
+            areas[name] = areas[name].where(published, areas[f"{name}_of_seeds"])
     return areas[["method", "task", "auc", "seeds", "standard_error"]]
 
 
