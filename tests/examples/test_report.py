@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import os
@@ -18,6 +19,8 @@ import pytest
 pytest.importorskip("matplotlib")
 pytest.importorskip("pandas")
 pytest.importorskip("scipy")
+
+from torchrl_etdmpc.commands import report  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "report.py"
@@ -175,6 +178,16 @@ def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_inter
     assert Path("stderr").read_text() == ""
     assert {path.name for path in Path("report").iterdir()} == FILES
     assert not list(Path().glob(".report*"))
+
+
+@pytest.mark.parametrize("name", ["a/walker-walk/seed1/config.yaml", "a/walker-walk/seed1/eval.csv", "experiment.yaml"])
+def test_watching_notices_what_a_report_reads(name):
+    root = make_experiment()
+    arguments = argparse.Namespace(runs=[str(root)])
+    before = report.stamp(arguments)
+    assert report.stamp(arguments) == before
+    (root / name).write_text((root / name).read_text() + "\n")
+    assert report.stamp(arguments) != before
 
 
 def test_names_make_methods_of_folders_and_options_are_obeyed(run_main, capfd):
