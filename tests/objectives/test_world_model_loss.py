@@ -209,6 +209,16 @@ def test_flags_in_another_place_than_the_loss_looks_are_named(make_loss, slices,
         loss(slices)
 
 
+def test_the_default_device_stops_no_check_of_a_batch(make_loss, slices):
+    loss = make_loss("model")
+    slices["next", "done"] = torch.zeros_like(slices["next", "terminated"])
+    torch.set_default_device("meta")
+    try:
+        assert loss(slices)["loss_reward"].isfinite()
+    finally:
+        torch.set_default_device(None)
+
+
 @pytest.mark.parametrize("where", ["done", "last"])
 def test_a_next_observation_that_is_missing_at_the_end_of_a_slice_is_refused(make_loss, slices, where):
     loss = make_loss("model")

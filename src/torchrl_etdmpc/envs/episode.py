@@ -123,7 +123,7 @@ class RecordedEnv(EnvBase):
             "random": self._random,
             "actions": torch.from_numpy(np.array(self._actions).reshape(-1, *self.action_spec.shape)),
             "fingerprint": torch.from_numpy(np.array(self._fingerprint())),
-            _PAID: self._episode_reward.view(torch.int32),
+            _PAID: self._episode_reward.clone().view(torch.int32),
         }
 
     def set_extra_state(self, state: dict[str, Tensor] | None) -> None:

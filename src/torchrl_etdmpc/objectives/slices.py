@@ -242,10 +242,11 @@ class SliceReader:
         if torch.compiler.is_compiling() or entries["action"].device.type != "cpu":
             return
         done, shape = tensordict.get(self.done_key, None), entries["action"].shape[:2]
-        ends = torch.zeros(shape, dtype=torch.bool)
-        if done is not None and done.numel() == shape.numel():
+        ends = torch.zeros(shape, dtype=torch.bool, device="cpu")  # whatever the default device is
+        if done is not None and done.device.type == "cpu" and done.numel() == shape.numel():
             ends |= done.reshape(shape).bool()
-        last = ends | (torch.arange(shape[1]) == shape[1] - 1)
+        last = ends.clone()
+        last[:, -1] = True
         for what, rows in ((f"where {self.done_key!r} is True", ends), ("at the last step of a slice", last)):
             rows = rows if counts is None else rows & counts
             if rows.any() and not _all_finite(entries["next_observation"], rows):
