@@ -81,6 +81,23 @@ def test_a_phase_that_goes_on_counts_from_where_it_was_and_so_does_its_time_left
     assert line[8:] == " learning: 999 of 1000 env steps, 1 min left"
 
 
+def test_where_steps_differ_in_length_nothing_says_how_long_the_rest_takes(monkeypatch, capsys):
+    terminal = one_terminal(monkeypatch)
+    with progress_bar("compilation", 4, "parts", time_left=False) as bar:
+        time.sleep(0.12)
+        bar.advance()
+    assert terminal.getvalue().splitlines()[-1].split("\r")[-1].endswith("| 1/4 parts")
+    monkeypatch.undo()
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with console(), progress_bar("compilation", 4, "parts", time_left=False) as bar:
+        now[0] = 60.0
+        bar.advance()
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line[8:] == " compilation: 1 of 4 parts"
+
+
 def test_a_missing_tqdm_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
     with pytest.raises(ImportError, match=r"^progress_bar needs tqdm, .*; run `pip install tqdm`\.$"):

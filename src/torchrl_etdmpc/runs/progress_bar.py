@@ -12,7 +12,14 @@ _LINE_EVERY_S = 60.0
 
 
 def progress_bar(
-    phase: str, total: int, unit: str, *, initial: int = 0, passing: bool = False, log_every_s: float = _LINE_EVERY_S
+    phase: str,
+    total: int,
+    unit: str,
+    *,
+    initial: int = 0,
+    passing: bool = False,
+    time_left: bool = True,
+    log_every_s: float = _LINE_EVERY_S,
 ) -> ProgressBar:
     """A bar on stderr: phase, share, steps, time left; where there is no terminal, a line in the log now and then.
 
@@ -25,6 +32,8 @@ def progress_bar(
         initial (int): steps already done, for a phase that goes on. Default: 0.
         passing (bool): whether the bar disappears when its phase ends, and stays silent without a terminal. Default:
             ``False``.
+        time_left (bool): ``False`` where steps do not take about equally long, so that nothing follows from those that
+            are done. Default: ``True``.
         log_every_s (float): seconds between two lines of the log. Default: 60.
 
     Returns:
@@ -50,9 +59,10 @@ def progress_bar(
         leave=not passing,
         dynamic_ncols=True,
         smoothing=0,  # evaluations and checkpoints interrupt a phase; its average holds them in their share
-        bar_format="{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {unit}, {remaining} left{postfix}",
+        bar_format="{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {unit}"
+        + (", {remaining} left{postfix}" if time_left else "{postfix}"),
     )
-    return ProgressBar(bar, phase, total, unit, initial, log_every_s if not passing else float("inf"))
+    return ProgressBar(bar, phase, total, unit, initial, time_left, log_every_s if not passing else float("inf"))
 
 
 class ProgressBar:
@@ -60,18 +70,21 @@ class ProgressBar:
 
     Args:
         bar (tqdm): counts the steps; disabled where there is no terminal.
-        phase (str): as are the next three, what :func:`progress_bar` was given.
+        phase (str): as are the next four, what :func:`progress_bar` was given.
         total (int): how many steps it has.
         unit (str): what they are.
         initial (int): steps already done.
+        time_left (bool): whether it says how long the rest takes.
         log_every_s (float): seconds between two lines of the log, where the bar is disabled.
 
     >>> with progress_bar("pretraining", 10, "updates") as bar:
     ...     bar.update(10)
     """
 
-    def __init__(self, bar: Any, phase: str, total: int, unit: str, initial: int, log_every_s: float) -> None:
-        self._bar, self._phase, self._total, self._unit = bar, phase, total, unit
+    def __init__(
+        self, bar: Any, phase: str, total: int, unit: str, initial: int, time_left: bool, log_every_s: float
+    ) -> None:
+        self._bar, self._phase, self._total, self._unit, self._time_left = bar, phase, total, unit, time_left
         self._log_every_s = log_every_s
         self._began = self._logged = time.monotonic()
         self._initial = self._done = initial
@@ -92,7 +105,8 @@ class ProgressBar:
         elif (now := time.monotonic()) - self._logged >= self._log_every_s:
             self._logged = now
             left = (now - self._began) * (self._total - done) / max(done - self._initial, 1)
-            parts = [f"{done} of {self._total} {self._unit}", f"{_duration(left)} left", self._note]
+            left = f"{_duration(left)} left" if self._time_left else ""
+            parts = [f"{done} of {self._total} {self._unit}", left, self._note]
             torchrl_logger.info(f"{self._phase}: {', '.join(part for part in parts if part)}")
 
     def advance(self) -> None:

@@ -51,7 +51,8 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     try:
         with contextlib.ExitStack() as stack:
             stack.enter_context(torch.random.fork_rng([device] if device.type == "cuda" else []))
-            progress = stack.enter_context(progress_bar("compilation", len(parts) * calls, "parts"))
+            # Processes work side by side and parts differ in size: what is done says nothing about the time left.
+            progress = stack.enter_context(progress_bar("compilation", len(parts), "parts", time_left=False))
 
             def call(names: Sequence[str]) -> None:
                 for name in names:
@@ -68,8 +69,8 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
                     helper.wait()
             for names in others:
                 call(names)
-            for _ in range(calls - 1):
-                call([*parts])
+            for part in [*parts.values()] * (calls - 1):
+                part()
     except Exception as error:
         if config.compile != "auto":
             raise
