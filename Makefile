@@ -22,6 +22,11 @@ HUMANOID_COMMIT := 791405f5eacf879adbc99105adb3fee73f5a49fc
 HUMANOID_VENV := .venv-humanoidbench
 # What was typed, for what to type next.
 SAME_RUN = $(if $(filter command line,$(origin RUN_DIR)), RUN_DIR="$(RUN_DIR)",$(if $(filter command line,$(origin TASK)), TASK=$(TASK)))
+# A run that goes on has its own settings: only what was typed is named.
+TYPED = $(if $(filter command line,$(origin $1)),$2)
+GOES_ON = $(if $(filter resume=true resume=auto resume=weights,$(ARGS)),$(shell test -e "$(RUN_DIR)/config.yaml" && echo yes))
+OF_RUN = $(call TYPED,TASK,task=$(TASK)) $(call TYPED,THREADS,threads=$(THREADS))
+OF_NEW_RUN = task=$(TASK) preset=cpu threads=$(THREADS) seed=1 total_env_steps=20000 eval_every=5000
 
 .DEFAULT_GOAL := help
 .PHONY: help train watch report test lint bench docs docs-serve humanoidbench clean
@@ -40,10 +45,10 @@ help:
 	@echo "All need Python 3.11 or 3.12 with venv; another one than python3: make test PYTHON=python3.12"
 
 # The command then speaks of RUN_DIR and ARGS, as they were typed here.
-train: export TORCHRL_ETDMPC_MAKE := 1
+train: export TORCHRL_ETDMPC_MAKE = make train$(SAME_RUN)
 train: $(READY)
-	@echo "$(TASK) learns on this CPU, in some minutes; Ctrl-C stops and saves"
-	@$(VENV)/bin/python examples/train_dmc.py task=$(TASK) preset=cpu threads=$(THREADS) seed=1 total_env_steps=20000 eval_every=5000 run_dir="$(RUN_DIR)" $(ARGS)
+	@echo "$(if $(GOES_ON),the run in $(RUN_DIR) goes on,$(TASK) learns on this CPU, in some minutes); Ctrl-C stops and saves"
+	@$(VENV)/bin/python examples/train_dmc.py $(if $(GOES_ON),$(OF_RUN),$(OF_NEW_RUN)) run_dir="$(RUN_DIR)" $(ARGS)
 	@echo 'the curve:        $(RUN_DIR)/curve.png'
 	@echo 'a film of it:     make watch$(SAME_RUN)'
 	@echo 'a report:         make report$(SAME_RUN)'
@@ -83,7 +88,7 @@ docs: $(DOCS_READY)
 	@$(VENV)/bin/python docs/check_site.py build/docs/html
 	@echo 'the site: build/docs/html/index.html, or: make docs-serve'
 
-docs-serve: $(DOCS_READY)
+docs-serve: $(READY)
 	@test -f build/docs/html/index.html || { echo "error: there is no site yet; run make docs" >&2; exit 1; }
 	@echo "http://127.0.0.1:$(PORT), Ctrl-C ends it"
 	@$(VENV)/bin/python -m http.server --bind 127.0.0.1 --directory build/docs/html $(PORT)

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import (
@@ -238,6 +238,19 @@ class BrokenEnv(CountingEnv):
 def test_a_value_that_is_not_finite_is_no_return(key, value):
     with pytest.raises(NonFiniteError, match=f"^the environment returned a non-finite '{key}' at decision step 3$"):
         evaluate(BrokenEnv(key, value), ConstantPolicy(), episodes=1)
+
+
+def test_an_action_and_a_first_observation_are_looked_at_too():
+    class BrokenFirst(CountingEnv):
+        def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+            first = super()._reset(tensordict)
+            return first.set("observation", torch.full_like(first["observation"], torch.nan))
+
+    with pytest.raises(NonFiniteError, match="^the environment returned a non-finite 'observation' at decision step 0"):
+        evaluate(BrokenFirst(5), ConstantPolicy(), episodes=1)
+    policy = TensorDictModule(lambda observation: observation * torch.nan, ["observation"], ["action"])
+    with pytest.raises(NonFiniteError, match="^the policy returned a non-finite 'action' at decision step 1$"):
+        evaluate(CountingEnv(5), policy, episodes=1)
 
 
 class BrokenLater(CountingEnv):

@@ -176,5 +176,6 @@ def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):
 def test_messages_speak_the_words_of_make(monkeypatch):
     text = "run_dir=runs/a already holds a run; go on with resume=true."
     assert as_typed(text) == text
-    monkeypatch.setenv("TORCHRL_ETDMPC_MAKE", "1")
-    assert as_typed(text) == 'RUN_DIR=runs/a already holds a run; go on with ARGS="resume=true".'
+    monkeypatch.setenv("TORCHRL_ETDMPC_MAKE", 'make train RUN_DIR="runs/a"')
+    expected = 'RUN_DIR=runs/a already holds a run; go on with make train RUN_DIR="runs/a" ARGS="resume=true".'
+    assert as_typed(text) == expected

@@ -20,7 +20,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_etdmpc.envs import DMC_TASKS, get_task, make_env
+from torchrl_etdmpc.envs import DMC_TASKS, Task, get_task, make_env
 from torchrl_etdmpc.envs.dmc import domain_and_task
 
 pytest.importorskip("dm_control")
@@ -347,6 +347,12 @@ def test_a_mujoco_that_breaks_this_dm_control_is_refused_in_one_line(mujoco, dm_
 def test_an_unknown_task_is_refused_with_the_nearest_names():
     with pytest.raises(ValueError, match="^unknown task 'walker_walk'; did you mean walker-walk"):
         make_env("walker_walk")
+
+
+def test_actuators_without_a_range_are_refused():
+    task = Task("lqr-lqr_2_1", "dm_control", episode_length=100)
+    with pytest.raises(ValueError, match=r"actions have no finite bounds \(they reach from -1e\+10 to 1e\+10\), so"):
+        make_env(task)
 
 
 def test_no_environments_at_all_is_refused():

@@ -186,6 +186,10 @@ _REFUSED = {
     ),
     "no bounds": ({"action": Box(-np.inf, np.inf, (2,))}, "has actions without finite bounds, so they cannot be"),
     "half-open": ({"action": Box(0, np.inf, (2,))}, "has actions without finite bounds, so they cannot be"),
+    "as good as none": (
+        {"action": Box(np.finfo(np.float32).min, np.finfo(np.float32).max, (2,))},
+        "has actions without finite bounds, so they cannot be",
+    ),
     "pixels": (
         {"observation": Box(0, 255, (8, 8, 3), np.uint8)},
         r"has pixel observations \[8, 8, 3\]; only vectors are supported\.",

@@ -27,6 +27,13 @@ def test_an_episode_of_another_length_has_none():
 
 
 @needs_gymnasium
+def test_neither_has_one_that_is_registered_with_another_length(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.envs.tasks._tasks", {})
+    register_task(Task("gym/InvertedPendulum-v5", "gymnasium", episode_length=100))
+    assert success_return(get_task("gym/InvertedPendulum-v5")) is None
+
+
+@needs_gymnasium
 def test_an_episode_of_a_task_without_a_limit_of_its_own_has_none(monkeypatch):
     import gymnasium
 

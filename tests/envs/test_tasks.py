@@ -157,6 +157,15 @@ def test_a_gymnasium_id_without_a_time_limit_asks_for_one():
     assert get_task("gym/CliffWalking-v1", episode_length=30).episode_length == 30
 
 
+def test_gymnasium_s_own_word_for_no_limit_asks_for_one_too(monkeypatch):
+    registration = pytest.importorskip("gymnasium").envs.registration
+    endless = dataclasses.replace(registration.registry["Pendulum-v1"], id="Endless-v0", max_episode_steps=-1)
+    monkeypatch.setitem(registration.registry, "Endless-v0", endless)
+    with pytest.raises(ValueError, match="^Gymnasium sets no time limit for Endless-v0; give one in env steps"):
+        get_task("gym/Endless-v0")
+    assert get_task("gym/Endless-v0", episode_length=30).episode_length == 30
+
+
 def test_an_unknown_gymnasium_id_is_answered_with_the_nearest_ids():
     pytest.importorskip("gymnasium")
     with pytest.raises(ValueError, match=r"^unknown task 'gym/Pendulum-v7'; did you mean gym/Pendulum-v1"):

@@ -60,6 +60,7 @@ def frozen_by_gymnasium():
     return env
 def of_a_suite(): return TransformedEnv(make_env("gym/Pendulum-v1"), RewardScaling(0, 0.1))
 def limited(): return scaled(StepCounter(30))
+def only_told(): return scaled(StepCounter(30, update_done=False), base=GymWrapper(PendulumEnv()))
 def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
 def unlimited(): return scaled(base=GymWrapper(PendulumEnv()))
 def repeats(): return scaled(frame_skip=4)
@@ -219,7 +220,7 @@ def test_a_repeat_of_actions_that_are_scaled_already_is_refused(folder):
     assert arrived == [1.0] * 4  # of [-2, 2]
 
 
-@pytest.mark.parametrize("name", ["unlimited", "counted"])
+@pytest.mark.parametrize("name", ["unlimited", "counted", "only_told"])
 def test_a_time_limit_that_is_told_ends_episodes(folder, name):
     with pytest.raises(ValueError) as error:
         import_task(f"more_tasks:{name}")

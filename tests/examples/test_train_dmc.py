@@ -167,7 +167,7 @@ REFUSED = [
     ("planner.num_proposals=600", "planner.num_proposals must be in [0, num_samples=512), got 600."),
     ("planner.first_action=worst", "planner.first_action must be one of elite, mean, best, got 'worst'."),
     ("planner.score=median", "planner.score must be one of final, mean, adaptive, got 'median'."),
-    ("planner.std_min=-1", "planner.std_min must be in (0, std_max=2.0], got -1.0."),
+    ("planner.std_min=-1", "planner.std_min must be in [1e-06, std_max=2.0], got -1.0."),
     ("planner.scoring_dtype=int8", "planner.scoring_dtype must be one of float16, bfloat16, float32, float64, got "),
     ("reanalyze.num_elites=100", "reanalyze.num_elites must be at most num_samples=64, got 100."),
     ("reanalyze.num_slices=0", "reanalyze.num_slices must be at least 1, got 0."),

@@ -39,6 +39,12 @@ def test_a_size_below_one_is_refused_by_name(name, size):
         WorldModel(**{"observation_dim": O, "action_dim": A, name: size})
 
 
+@pytest.mark.parametrize("name", ["mlp_dim", "encoder_dim", "simnorm_dim"])
+def test_a_size_that_would_make_a_network_constant_is_refused(name):
+    with pytest.raises(ValueError, match=rf"^{name} must be at least 2, got 1: what is normalised over one number is"):
+        WorldModel(O, A, **{name: 1})
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -71,7 +71,7 @@ def test_an_analytic_world_answers_like_a_world_model(name):
         world.observation_dim,
         world.action_dim,
         latent_dim=world.latent_dim,
-        simnorm_dim=1,
+        simnorm_dim=world.latent_dim,
         mlp_dim=8,
         encoder_dim=8,
         num_dynamics=world.num_dynamics,

@@ -33,9 +33,9 @@ CONFIGURATIONS = st.fixed_dictionaries(
         "model": st.fixed_dictionaries(
             {
                 "latent_dim": mostly(st.sampled_from([8, 16, 24]), 20),
-                "simnorm_dim": st.sampled_from([1, 4, 8]),
-                "mlp_dim": mostly(st.integers(1, 9), 0),
-                "encoder_dim": st.integers(1, 9),
+                "simnorm_dim": st.sampled_from([2, 4, 8]),
+                "mlp_dim": mostly(st.integers(2, 9), 0),
+                "encoder_dim": st.integers(2, 9),
                 "encoder_layers": mostly(st.integers(1, 3), 0),
                 "num_dynamics": FEW,
                 "num_values": FEW,

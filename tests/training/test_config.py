@@ -484,8 +484,8 @@ REFUSED_BY_A_PART = [
     ({"reanalyze__num_proposals": -1}, "reanalyze.num_proposals must be in [0, num_samples=64), got -1."),
     ({"planner__extra_iterations": -1}, "planner.extra_iterations must not be negative, got -1."),
     ({"planner__inverse_temperature": -0.5}, "planner.inverse_temperature must be finite and not negative, got -0.5."),
-    ({"planner__std_min": 0.0}, "planner.std_min must be in (0, std_max=2.0], got 0.0."),
-    ({"reanalyze__std_min": 3.0}, "reanalyze.std_min must be in (0, std_max=2.0], got 3.0."),
+    ({"planner__std_min": 0.0}, "planner.std_min must be in [1e-06, std_max=2.0], got 0.0."),
+    ({"reanalyze__std_min": 3.0}, "reanalyze.std_min must be in [1e-06, std_max=2.0], got 3.0."),
     (
         {"planner__score": "adaptive", "planner__beta": -1.0},
         "planner.beta must not be negative with the adaptive score, got -1.0; score='final' and score='mean' take a "

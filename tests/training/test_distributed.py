@@ -13,18 +13,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import StepCounter
+from torchrl.envs import ActionScaling, Compose, EnvBase, GymEnv, RewardScaling, StepCounter, TransformedEnv
 
 pytest.importorskip("gymnasium")
 
 import torchrl_etdmpc.training.distributed as distributed  # noqa: E402
 from torchrl_etdmpc.checkpoints import CheckpointStore  # noqa: E402
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError  # noqa: E402
-from torchrl_etdmpc.envs import make_env  # noqa: E402
+from torchrl_etdmpc.envs import Task, make_env, register_task, tasks  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     DistributedConfig,
@@ -272,6 +273,29 @@ def test_a_worker_that_fails_before_its_first_rows_ends_the_run(started):
         learner.step()
     assert not isinstance(caught.value, SimulatorError)
     learner.collector.shutdown()
+
+
+def test_a_worker_has_the_maker_that_the_program_has_registered(monkeypatch):
+    def paid(task: Task, *, device: torch.device | str) -> EnvBase:
+        return TransformedEnv(
+            GymEnv("Pendulum-v1", device=device), Compose(ActionScaling(), RewardScaling(1000.0, 1.0))
+        )
+
+    def in_another_process(parts: distributed.WorkerParts) -> distributed.WorkerParts:
+        sent = cloudpickle.dumps(parts)
+        monkeypatch.setattr(tasks, "_tasks", {})
+        monkeypatch.setattr(tasks, "_makers", {})
+        return cloudpickle.loads(sent)
+
+    monkeypatch.setattr(tasks, "_tasks", dict(tasks._tasks))
+    monkeypatch.setattr(tasks, "_makers", {})
+    config = config_of()
+    parts = distributed.WorkerParts(config, (3, 1), 0.99, None, distributed.registered_by_the_program(config))
+    assert parts.registered is None
+    register_task(Task(config.task, "gymnasium", episode_length=200), paid)
+    parts = distributed.WorkerParts(config, (3, 1), 0.99, None, distributed.registered_by_the_program(config))
+    rewards = in_another_process(parts).make_env(0).rollout(5)["next", "reward"]
+    assert (rewards > 900).all()
 
 
 def test_rows_that_are_not_finite_are_not_stored(started):

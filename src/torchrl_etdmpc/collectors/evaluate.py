@@ -53,7 +53,8 @@ def evaluate(
         Episodes: the return and the length of each, shape ``[episodes]``.
 
     Raises:
-        NonFiniteError: if the environment returns a reward or an observation that is not finite.
+        NonFiniteError: if the environment returns a reward or an observation that is not finite, or the policy an
+            action.
         ValueError: if ``episodes`` is not positive, or the environment does not fit the planner's model, e.g. because
             its actions have other bounds.
 
@@ -111,20 +112,24 @@ def _round(
     total = torch.zeros(num_envs, device="cpu")  # whatever the default device is
     length = torch.zeros_like(total, dtype=torch.int64)
     running = torch.ones_like(total, dtype=torch.bool)
+    decisions = 0
+    _require_finite(tensordict, observed, running, "the environment", decisions)
     while running.any():
+        decisions += 1
         if policy_device is None:
             tensordict = policy(tensordict)
         else:
             inputs = tensordict.select(*policy.in_keys, strict=False).to(policy_device)
             outputs = policy(inputs).select(*policy.out_keys, strict=False)
             tensordict = tensordict.update(outputs.to(env.device or "cpu"))
+        _require_finite(tensordict, env.action_keys, running, "the policy", decisions)
         if env.batch_size:
             stepped, tensordict = env.step_and_maybe_reset(tensordict)
         else:  # the next episode begins with the next round's reset
             stepped = env.step(tensordict)
             tensordict = env.step_mdp(stepped)
         following = stepped.get("next")
-        _require_finite(following, (reward, *observed), running, int(length.max()) + 1)
+        _require_finite(following, (reward, *observed), running, "the environment", decisions)
         total += torch.where(running, following.get(reward).reshape(num_envs).cpu(), 0)
         length += running
         running &= ~following.get(done).reshape(num_envs).cpu()
@@ -133,12 +138,14 @@ def _round(
     return Episodes(total, length)
 
 
-def _require_finite(following: TensorDictBase, keys: Iterable[NestedKey], running: Tensor, decisions: int) -> None:
+def _require_finite(
+    tensordict: TensorDictBase, keys: Iterable[NestedKey], running: Tensor, source: str, decisions: int
+) -> None:
     """Of the environments whose episode counts still; what the others do is thrown away."""
     for key in keys:
-        value = following.get(key)
+        value = tensordict.get(key)
         if value is None or not value.is_floating_point():
             continue
         finite = value.isfinite().reshape(len(running), -1).all(-1).cpu()
         if not finite[running].all():
-            raise NonFiniteError(f"the environment returned a non-finite {key!r} at decision step {decisions}")
+            raise NonFiniteError(f"{source} returned a non-finite {key!r} at decision step {decisions}")

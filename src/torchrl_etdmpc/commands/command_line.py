@@ -55,9 +55,10 @@ def as_typed(text: str) -> str:
     "task.action_repeat of task 'walker-walk' must be at least 1, got 0."
     """
     text = re.sub(rf"^({'|'.join(TASK_SETTINGS)}) of task", r"task.\1 of task", text)
-    if os.environ.get("TORCHRL_ETDMPC_MAKE") != "1":
+    make = os.environ.get("TORCHRL_ETDMPC_MAKE")  # the command that was typed, without its ARGS
+    if not make:
         return text
-    text = re.sub(r"\b(resume=\w+)", r'ARGS="\1"', text)
+    text = re.sub(r"\b(resume=\w+)", lambda found: f'{make} ARGS="{found[1]}"', text)
     return re.sub(r"\brun_dir\b", "RUN_DIR", text)
 
 

@@ -12,6 +12,9 @@ from torchrl.envs import DTypeCastTransform, EnvBase, FrameSkipTransform
 
 from torchrl_etdmpc.envs.layers import transforms_by_layer
 
+UNLIMITED = 1e10
+"""MuJoCo's bound of an actuator that has none (mjMAXVAL)."""
+
 __all__ = ["check_env", "check_spaces"]
 
 
@@ -218,7 +221,7 @@ def action_faults(spec: TensorSpec, dtype: torch.dtype = torch.float32, key: Nes
     if spec.domain != "continuous":
         yield f"{name} is discrete ({type(spec).__name__}); only continuous actions are supported"
         return
-    if not isinstance(spec, Bounded) or not (spec.space.low.isfinite().all() and spec.space.high.isfinite().all()):
+    if not isinstance(spec, Bounded) or not (torch.stack([spec.space.low, spec.space.high]).abs() < UNLIMITED).all():
         yield f"{name} has no finite bounds, so it cannot be rescaled (give the environment's action_spec some)"
     else:
         bounds = torch.stack([spec.space.low.flatten(), spec.space.high.flatten()], -1)

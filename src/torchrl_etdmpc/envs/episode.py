@@ -17,12 +17,14 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 
+from torchrl_etdmpc.envs.check import UNLIMITED
 from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
 
 __all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
 
 _TRANSFORMS = "transforms"
 _PAID = "episode_reward"
+_PLACE = "fingerprint"
 """Where a state has what the transforms around the simulator remember, by their place."""
 
 
@@ -68,6 +70,11 @@ class RecordedEnv(EnvBase):
             device=self.device,
         )
         self.reward_spec = Unbounded(1, dtype=torch.float32, device=self.device)
+        if not (np.abs([low, high]) < UNLIMITED).all():
+            raise ValueError(
+                f"actions have no finite bounds (they reach from {low.min():g} to {high.max():g}), so they cannot be "
+                "rescaled to [-1, 1]; give every actuator a range."
+            )
         self._middle, self._half_width = (high + low) / 2, (high - low) / 2
         # Rounding may lead past the bounds by a bit, where a simulator that checks its actions fails.
         past = (self._middle + self._half_width > high) | (self._middle - self._half_width < low)
@@ -122,7 +129,7 @@ class RecordedEnv(EnvBase):
         return {
             "random": self._random,
             "actions": torch.from_numpy(np.array(self._actions).reshape(-1, *self.action_spec.shape)),
-            "fingerprint": torch.from_numpy(np.array(self._fingerprint())),
+            _PLACE: torch.from_numpy(np.array(self._fingerprint())),
             _PAID: self._episode_reward.clone().view(torch.int32),
         }
 
@@ -239,7 +246,10 @@ def _as_old_as(saved: Any, now: Any) -> Any:
     """The state of now without what the version that saved the other one did not keep."""
     if not isinstance(saved, dict) or not isinstance(now, dict):
         return now
-    return {name: _as_old_as(saved.get(name), part) for name, part in now.items() if name in saved or name != _PAID}
+    kept = {name: _as_old_as(saved.get(name), part) for name, part in now.items() if name in saved or name != _PAID}
+    if _PLACE in kept and isinstance(saved.get(_PLACE), Tensor):
+        kept[_PLACE] = kept[_PLACE][: len(saved[_PLACE])]  # it is told by more numbers now
+    return kept
 
 
 def transform_states(env: EnvBase) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import GymWrapper
 
+from torchrl_etdmpc.envs.check import UNLIMITED
 from torchrl_etdmpc.envs.episode import RecordedEnv
 from torchrl_etdmpc.envs.random_states import pack_pcg64, unpack_pcg64
 from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM, Maker, Task
@@ -71,7 +72,8 @@ class RecordedGymnasiumEnv(RecordedEnv, GymWrapper):
     def _fingerprint(self) -> np.ndarray:
         data = getattr(self._env.unwrapped, "data", None)
         if all(hasattr(data, name) for name in ("qpos", "qvel", "time")):  # MuJoCo
-            return np.concatenate([data.qpos, data.qvel, [data.time]])
+            # And what wrappers have made of them, by random numbers of their own, or remember.
+            return np.concatenate([data.qpos, data.qvel, [data.time], np.ravel(self._observation)])
         return self._observation
 
 
@@ -90,7 +92,10 @@ def gymnasium_maker(task: Task) -> Maker:
 
     spec = gymnasium.registry.get(task.name.removeprefix("gym/"))
     if spec is None:
-        raise ValueError(f"the task {task.name!r} of suite 'gymnasium' must be called gym/<id>, by an id of Gymnasium.")
+        raise ValueError(
+            f"the task {task.name!r} of suite 'gymnasium' must be called gym/<id>, by an id that Gymnasium knows in "
+            "this process; register it where every process imports it, or give register_task a maker of your own."
+        )
     return partial(_make, spec)
 
 
@@ -98,7 +103,8 @@ def gymnasium_success_return(task: Task) -> float | None:
     """The return that Gymnasium calls solved; ``None`` for a task without one."""
     import gymnasium
 
-    return gymnasium.spec(task.name.removeprefix("gym/")).reward_threshold
+    spec = gymnasium.spec(task.name.removeprefix("gym/"))
+    return spec.reward_threshold if spec.max_episode_steps == task.episode_length else None
 
 
 def _takes_render_mode(creator: Any) -> bool:
@@ -167,5 +173,5 @@ def _require_vectors(name: str, env: Any) -> None:
     if not isinstance(actions, Box) or not np.issubdtype(actions.dtype, np.floating):
         kind = type(actions).__name__ if not isinstance(actions, Box) else f"dtype {actions.dtype}"
         raise ValueError(f"{name} has discrete actions ({kind}); only continuous actions are supported.")
-    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+    if not (np.abs([actions.low, actions.high]) < UNLIMITED).all():
         raise ValueError(f"{name} has actions without finite bounds, so they cannot be rescaled to [-1, 1].")

@@ -290,7 +290,7 @@ def _gymnasium_task(name: str, told: dict[str, Any]) -> Task:
         hint = f"did you mean {', '.join(f'gym/{other}' for other in nearest)}? " if nearest else ""
         raise ValueError(f"unknown task {name!r}; {hint}task=list on the command line lists those of MuJoCo.")
     limit = gymnasium.registry[env_id].max_episode_steps
-    if limit is None and "episode_length" not in told:
+    if limit in (None, -1) and "episode_length" not in told:
         raise ValueError(f"Gymnasium sets no time limit for {env_id}; give one in env steps: task.episode_length=")
     terminates = env_id.rpartition("-v")[0] not in _GYMNASIUM_NEVER_TERMINATES
     return Task(name, "gymnasium", **({"episode_length": limit, "terminates": terminates} | told))

@@ -226,7 +226,8 @@ def _wrapper_repeat(wrapper: Any) -> int:
 
 def _limit(env: EnvBase) -> int | None:
     """The time limit of this environment in env steps, the least that its layers tell."""
-    counters = (transform for transform in transforms_of(env) if isinstance(transform, StepCounter))
+    # One that only tells, and ends nothing (update_done=False), is no limit.
+    counters = (each for each in transforms_of(env) if isinstance(each, StepCounter) and each.update_done)
     limits = [counter.max_steps * _action_repeat(env) for counter in counters if counter.max_steps is not None]
     return min([*limits, *_simulators_limits(env)], default=None)
 

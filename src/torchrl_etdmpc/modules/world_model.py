@@ -106,6 +106,9 @@ class WorldModel(nn.Module):
         for name, size in sizes.items():
             if size < 1:
                 raise ValueError(f"{name} must be at least 1, got {size}.")
+        for name in ("mlp_dim", "encoder_dim", "simnorm_dim"):
+            if sizes[name] < 2:
+                raise ValueError(f"{name} must be at least 2, got 1: what is normalised over one number is a constant.")
         if latent_dim % simnorm_dim:
             raise ValueError(
                 f"latent_dim must be a multiple of simnorm_dim={simnorm_dim}, got {latent_dim}; "

@@ -14,6 +14,8 @@ InitialPlan = Literal["wide", "policy"]
 """Where a search begins: around the carried plan or zeros with the largest deviation, or where the policy is."""
 ScoringDtype = Literal["float16", "bfloat16", "float32", "float64"]
 """Names of the dtypes in which candidates can be scored."""
+_SMALLEST_STD = 1e-6
+"""Far below it single precision has no finite loss, and 0 is what a state without a plan has."""
 
 
 def check_budget(
@@ -39,8 +41,8 @@ def check_fit(discount: float, inverse_temperature: float, std_min: float, std_m
         raise ValueError(f"inverse_temperature must be finite and not negative, got {inverse_temperature}.")
     if not 0 < std_max < math.inf:
         raise ValueError(f"std_max must be finite and positive, got {std_max}.")
-    if not 0 < std_min <= std_max:
-        raise ValueError(f"std_min must be in (0, std_max={std_max}], got {std_min}.")
+    if not _SMALLEST_STD <= std_min <= std_max:
+        raise ValueError(f"std_min must be in [{_SMALLEST_STD:g}, std_max={std_max}], got {std_min}.")
 
 
 def check_choices(first_action: str, eval_first_action: str, initial: str) -> None:

@@ -22,7 +22,15 @@ from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.compilation import resolve_compile
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.ray_cluster import RayCluster
-from torchrl_etdmpc.training.workers import Actor, Engine, WorkerParts, send_weights, start_workers, why_it_failed
+from torchrl_etdmpc.training.workers import (
+    Actor,
+    Engine,
+    WorkerParts,
+    registered_by_the_program,
+    send_weights,
+    start_workers,
+    why_it_failed,
+)
 
 WEIGHT_AGE = "weight_age"
 """Key of a batch of rows: updates that the learner has made since the weights that each row was planned with."""
@@ -208,7 +216,7 @@ class WorkerCollector:
         if agent.planner.compiled_plan is not None:  # for the CPU, where workers plan, wherever the learner is
             decisions = config.total_decisions - config.seed_decisions
             compiled = resolve_compile(config.compile, torch.device("cpu"), decisions)
-        parts = WorkerParts(config, sizes, agent.planner.discount, compiled)
+        parts = WorkerParts(config, sizes, agent.planner.discount, compiled, registered_by_the_program(config))
         self._numbers = range(self._next_number, self._next_number + config.workers)
         self._next_number += config.workers
         self._last_worker = None

@@ -51,9 +51,10 @@ class EvaluationResult(NamedTuple):
 class Evaluator:
     """Plays the same episodes every time, so that what differs between two evaluations of a run is the agent.
 
-    Initial states and random numbers follow from ``seed`` alone, and those of the caller stay as they are, PyTorch's
-    and those of the generators that Python and NumPy share with simulators of this process: training is the same
-    whether it is evaluated or not, and a run that goes on needs nothing of its former evaluations.
+    Initial states and random numbers follow from ``seed`` alone, unless several environments play more than an episode
+    each and episodes end early: when the next ones begin is then the agent's doing. The random numbers of the caller
+    stay as they are, PyTorch's and those of the generators that Python and NumPy share with simulators of this process:
+    training is the same whether it is evaluated or not, and a run that goes on needs nothing of its former evaluations.
 
     Args:
         env (EnvBase): batch size [] or [n], without the planner's warm start; closed by :meth:`close`.
