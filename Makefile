@@ -58,9 +58,11 @@ train: $(READY)
 	@echo 'all settings:     $(VENV)/bin/python examples/train.py --help'
 
 watch: $(READY)
+	@test -n "$(findstring checkpoint=,$(ARGS))" -o -f "$(RUN_DIR)/checkpoints/best.pt" || { echo 'error: $(RUN_DIR) holds no trained agent; run make train$(SAME_RUN) first' >&2; exit 1; }
 	@$(VENV)/bin/python examples/evaluate.py checkpoint="$(RUN_DIR)/checkpoints/best.pt" episodes=1 video="$(RUN_DIR)/film.mp4" $(ARGS)
 
 report: $(READY)
+	@test -d "$(RUN_DIR)" || { echo 'error: there is no $(RUN_DIR); run make train$(SAME_RUN) first' >&2; exit 1; }
 	@$(VENV)/bin/python examples/report.py "$(RUN_DIR)" --out "$(RUN_DIR)/report" $(ARGS)
 
 # In the order of their names: the files with few tests, which would otherwise come last, take longest.

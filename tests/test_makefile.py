@@ -44,3 +44,15 @@ def test_a_run_that_goes_on_keeps_its_own_settings(run_dir, how):
     assert training_command(*typed) == ["threads=2", *end]
     assert training_command("TASK=cup-catch", *typed) == ["task=cup-catch", "threads=2", *end]
     assert "seed=1" in training_command(f"RUN_DIR={run_dir}", "ARGS=resume=off")
+
+
+@pytest.mark.parametrize(("target", "message"), [("watch", "holds no trained agent"), ("report", "there is no")])
+def test_what_needs_a_run_says_how_to_make_one(tmp_path, target, message):
+    venv = tmp_path / "venv"
+    venv.mkdir()
+    (venv / ".ready").touch()
+    command = ["make", target, f"VENV={venv}", f"RUN_DIR={tmp_path}/none", "TASK=cup-catch"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode != 0
+    assert f"error: {tmp_path}/none {message}" in result.stderr or f"error: {message} {tmp_path}/none" in result.stderr
+    assert f'run make train RUN_DIR="{tmp_path}/none" first' in result.stderr

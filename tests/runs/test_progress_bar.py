@@ -70,6 +70,17 @@ def test_a_file_gets_plain_lines_in_the_log_with_the_time_left(monkeypatch, caps
     assert sys.stderr.getvalue() == ""
 
 
+def test_a_phase_that_passes_has_its_lines_in_the_log_too(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with console(), progress_bar("evaluation", 500, "decisions", passing=True) as bar:
+        for now[0] in (30.0, 60.0, 90.0):
+            bar.advance()
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line[8:].startswith(" evaluation: 2 of 500 decisions, ")
+
+
 def test_a_phase_that_goes_on_counts_from_where_it_was_and_so_does_its_time_left(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])

@@ -113,6 +113,8 @@ def test_a_budget_may_be_the_benchmark_s(write):
         ValueError, match="'one' .*gym/Pendulum-v1 is of no benchmark, so budget must be a number of env"
     ):
         read_experiment(write(budget="benchmark", tasks=["gym/Pendulum-v1"])).runs(Path())
+    with pytest.raises(ValueError, match="unknown task 'walker-wlak'; did you mean walker-walk"):
+        read_experiment(write(budget="benchmark"), tasks=["walker-wlak"]).runs(Path())
 
 
 def test_settings_of_the_command_come_after_those_of_every_variant(write):

@@ -18,7 +18,7 @@ from torchrl_etdmpc.envs import Task, env_sizes, make_env, render_frame, success
 from torchrl_etdmpc.envs.layers import simulator_of
 from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.planners import BarePolicy
-from torchrl_etdmpc.runs import write_film
+from torchrl_etdmpc.runs import progress_bar, write_film
 from torchrl_etdmpc.runs.files import make_folder_of, write_whole
 from torchrl_etdmpc.runs.video import film_writer
 from torchrl_etdmpc.training import load_agent, resolve_device
@@ -88,6 +88,11 @@ def main(config: EvaluateConfig) -> None:
         if not ended:  # at its end the simulator stands at the start of another episode already
             frames.append(render_frame(_first(env), *size))
 
+    def after(step: TensorDictBase) -> None:
+        if config.video:
+            film(step)
+        bar.advance()
+
     if config.video:
         seed_everything(config.seed)
         env.reset()
@@ -96,9 +101,8 @@ def main(config: EvaluateConfig) -> None:
         film_writer(config.video)
         env.set_seed(config.seed)  # the episodes are those that are played without a film
     seed_everything(config.seed)
-    played = evaluate(
-        env, policy, episodes=config.episodes, policy_device=device, on_step=film if config.video else None
-    )
+    with progress_bar("evaluation", task.decision_steps_per_episode, "decisions", passing=True) as bar:
+        played = evaluate(env, policy, episodes=config.episodes, policy_device=device, on_step=after)
     env.close(raise_if_closed=False)
     elsewhere = "" if task.name == trained.task else f"on {trained.task} "
     told = _outcome(config, task, played, f"{elsewhere}for {counters.get('env_steps', 'an unknown number of')}")

@@ -30,8 +30,7 @@ def progress_bar(
 
     Keyword Args:
         initial (int): steps already done, for a phase that goes on. Default: 0.
-        passing (bool): whether the bar disappears when its phase ends, and stays silent without a terminal. Default:
-            ``False``.
+        passing (bool): whether the bar disappears when its phase ends. Default: ``False``.
         time_left (bool): ``False`` where steps do not take about equally long, so that nothing follows from those that
             are done. Default: ``True``.
         log_every_s (float): seconds between two lines of the log. Default: 60.
@@ -62,7 +61,7 @@ def progress_bar(
         bar_format="{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} {unit}"
         + (", {remaining} left{postfix}" if time_left else "{postfix}"),
     )
-    return ProgressBar(bar, phase, total, unit, initial, time_left, log_every_s if not passing else float("inf"))
+    return ProgressBar(bar, phase, total, unit, initial, time_left, log_every_s)
 
 
 class ProgressBar:

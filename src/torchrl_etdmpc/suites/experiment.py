@@ -13,7 +13,7 @@ from typing import Any, Literal
 import yaml
 
 from torchrl_etdmpc.analysis import BENCHMARKS
-from torchrl_etdmpc.envs import DMC_TASKS
+from torchrl_etdmpc.envs import DMC_TASKS, get_task
 from torchrl_etdmpc.runs import DamagedFileError, RunDirectory
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.runs.files import read_whole, write_whole
@@ -235,6 +235,8 @@ class Experiment:
         for benchmark in BENCHMARKS.values():
             if task in benchmark.tasks:
                 return benchmark.budget
+        if ":" not in task:
+            get_task(task)  # one that is misspelt is of no benchmark either
         raise ValueError(f"{task} is of no benchmark, so budget must be a number of env steps.")
 
     def proposals(self, task: str) -> list[tuple[str, TrainConfig]]:
