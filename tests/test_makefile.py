@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,11 +13,17 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+# Of a `make test` around them.
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
+
+
+def make(*typed: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["make", *typed], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True)
+
+
 def training_command(*typed: str) -> list[str]:
     """What ``make train`` would run."""
-    result = subprocess.run(
-        ["make", "-n", "train", "THREADS=2", *typed], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    result = make("-n", "train", "THREADS=2", *typed)
     (line,) = (line for line in result.stdout.splitlines() if "train_dmc.py" in line)
     return line.split("train_dmc.py ")[1].split()
 
@@ -51,8 +58,7 @@ def test_what_needs_a_run_says_how_to_make_one(tmp_path, target, message):
     venv = tmp_path / "venv"
     venv.mkdir()
     (venv / ".ready").touch()
-    command = ["make", target, f"VENV={venv}", f"RUN_DIR={tmp_path}/none", "TASK=cup-catch"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    result = make(target, f"VENV={venv}", f"RUN_DIR={tmp_path}/none", "TASK=cup-catch")
     assert result.returncode != 0
     assert f"error: {tmp_path}/none {message}" in result.stderr or f"error: {message} {tmp_path}/none" in result.stderr
     assert f'run make train RUN_DIR="{tmp_path}/none" first' in result.stderr

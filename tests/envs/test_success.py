@@ -31,6 +31,8 @@ def test_neither_has_one_that_is_registered_with_another_length(monkeypatch):
     monkeypatch.setattr("torchrl_etdmpc.envs.tasks._tasks", {})
     register_task(Task("gym/InvertedPendulum-v5", "gymnasium", episode_length=100))
     assert success_return(get_task("gym/InvertedPendulum-v5")) is None
+    register_task(Task("h1hand-walk", "humanoid_bench", episode_length=100))
+    assert success_return(get_task("h1hand-walk")) is None
 
 
 @needs_gymnasium

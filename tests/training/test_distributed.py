@@ -101,6 +101,13 @@ class Workers:
             worker.shutdown()
 
 
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers of this process register their task here, too."""
+    monkeypatch.setattr(tasks, "_tasks", dict(tasks._tasks))
+    monkeypatch.setattr(tasks, "_makers", dict(tasks._makers))
+
+
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Workers]]:
     """Replaces processes by workers in this one; returns those that were started, as they are."""
@@ -281,21 +288,27 @@ def test_a_worker_has_the_maker_that_the_program_has_registered(monkeypatch):
             GymEnv("Pendulum-v1", device=device), Compose(ActionScaling(), RewardScaling(1000.0, 1.0))
         )
 
-    def in_another_process(parts: distributed.WorkerParts) -> distributed.WorkerParts:
+    def rewards_in_another_process() -> torch.Tensor:
+        parts = distributed.WorkerParts(config, (3, 1), 0.99, None, distributed.known_here(config))
         sent = cloudpickle.dumps(parts)
-        monkeypatch.setattr(tasks, "_tasks", {})
-        monkeypatch.setattr(tasks, "_makers", {})
-        return cloudpickle.loads(sent)
+        with monkeypatch.context() as other:
+            other.setattr(tasks, "_tasks", {})
+            other.setattr(tasks, "_makers", {})
+            return cloudpickle.loads(sent).make_env(0).rollout(5)["next", "reward"]
 
-    monkeypatch.setattr(tasks, "_tasks", dict(tasks._tasks))
-    monkeypatch.setattr(tasks, "_makers", {})
     config = config_of()
-    parts = distributed.WorkerParts(config, (3, 1), 0.99, None, distributed.registered_by_the_program(config))
-    assert parts.registered is None
+    assert (rewards_in_another_process() < 0).all()
     register_task(Task(config.task, "gymnasium", episode_length=200), paid)
-    parts = distributed.WorkerParts(config, (3, 1), 0.99, None, distributed.registered_by_the_program(config))
-    rewards = in_another_process(parts).make_env(0).rollout(5)["next", "reward"]
-    assert (rewards > 900).all()
+    assert (rewards_in_another_process() > 900).all()
+
+
+def test_a_worker_knows_a_task_that_the_program_has_registered_without_a_maker(monkeypatch):
+    pytest.importorskip("dm_control")
+    register_task(Task("swimmer-swimmer6", "dm_control", action_repeat=2, episode_length=1000, terminates=False))
+    config = config_of(task="swimmer-swimmer6")
+    parts = distributed.WorkerParts(config, (25, 5), 0.99, None, distributed.known_here(config))
+    monkeypatch.setattr(tasks, "_tasks", {})
+    assert parts.make_env(0).rollout(2)["action"].shape == (2, 5)
 
 
 def test_rows_that_are_not_finite_are_not_stored(started):

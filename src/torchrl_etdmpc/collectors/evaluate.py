@@ -108,6 +108,7 @@ def _round(
     """The first episode of every environment."""
     observed = env.observation_spec.keys(include_nested=True, leaves_only=True)
     reward, done = env.reward_keys[0], next(key for key in env.done_keys if "done" in (key, key[-1]))
+    actions = env.action_keys
     tensordict = env.reset()
     total = torch.zeros(num_envs, device="cpu")  # whatever the default device is
     length = torch.zeros_like(total, dtype=torch.int64)
@@ -122,7 +123,7 @@ def _round(
             inputs = tensordict.select(*policy.in_keys, strict=False).to(policy_device)
             outputs = policy(inputs).select(*policy.out_keys, strict=False)
             tensordict = tensordict.update(outputs.to(env.device or "cpu"))
-        _require_finite(tensordict, env.action_keys, running, "the policy", decisions)
+        _require_finite(tensordict, actions, running, "the policy", decisions)
         if env.batch_size:
             stepped, tensordict = env.step_and_maybe_reset(tensordict)
         else:  # the next episode begins with the next round's reset

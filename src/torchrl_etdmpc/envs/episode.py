@@ -23,9 +23,9 @@ from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
 __all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
 
 _TRANSFORMS = "transforms"
+"""Where a state has what the transforms around the simulator remember, by their place."""
 _PAID = "episode_reward"
 _PLACE = "fingerprint"
-"""Where a state has what the transforms around the simulator remember, by their place."""
 
 
 class RecordedEnv(EnvBase):

@@ -103,8 +103,7 @@ def gymnasium_success_return(task: Task) -> float | None:
     """The return that Gymnasium calls solved; ``None`` for a task without one."""
     import gymnasium
 
-    spec = gymnasium.spec(task.name.removeprefix("gym/"))
-    return spec.reward_threshold if spec.max_episode_steps == task.episode_length else None
+    return gymnasium.spec(task.name.removeprefix("gym/")).reward_threshold
 
 
 def _takes_render_mode(creator: Any) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torchrl_etdmpc.envs.gymnasium import gymnasium_success_return
 from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_success_return
-from torchrl_etdmpc.envs.tasks import Task, get_task, registered_maker
+from torchrl_etdmpc.envs.tasks import Task, registered_maker, suite_task
 
 __all__ = ["success_return"]
 
@@ -34,8 +34,8 @@ def success_return(task: Task) -> float | None:
     if look_up is None:
         return None
     try:
-        own = get_task(task.name).episode_length
-    except ValueError:  # it has no limit of its own
+        own = suite_task(task.name).episode_length  # whatever the program has registered
+    except ValueError:  # it has no limit of its own, or another name
         return None
     if task.episode_length != own:
         return None

@@ -223,6 +223,15 @@ def get_task(
     told = {field: value for field, value in told.items() if value is not None}
     if name in _tasks:
         return dataclasses.replace(_tasks[name], **told)
+    return suite_task(name, **told)
+
+
+def suite_task(name: str, **told: Any) -> Task:
+    """The entry of a task of Gymnasium or HumanoidBench as its suite makes it, with what was told in it.
+
+    Raises:
+        ValueError, ImportError: as by :func:`get_task`.
+    """
     if str(name).startswith("gym/"):
         return _gymnasium_task(name, told)
     if ":" in str(name):

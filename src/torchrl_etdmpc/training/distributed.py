@@ -26,7 +26,7 @@ from torchrl_etdmpc.training.workers import (
     Actor,
     Engine,
     WorkerParts,
-    registered_by_the_program,
+    known_here,
     send_weights,
     start_workers,
     why_it_failed,
@@ -216,7 +216,7 @@ class WorkerCollector:
         if agent.planner.compiled_plan is not None:  # for the CPU, where workers plan, wherever the learner is
             decisions = config.total_decisions - config.seed_decisions
             compiled = resolve_compile(config.compile, torch.device("cpu"), decisions)
-        parts = WorkerParts(config, sizes, agent.planner.discount, compiled, registered_by_the_program(config))
+        parts = WorkerParts(config, sizes, agent.planner.discount, compiled, known_here(config))
         self._numbers = range(self._next_number, self._next_number + config.workers)
         self._next_number += config.workers
         self._last_worker = None

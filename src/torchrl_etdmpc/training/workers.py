@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_etdmpc.collectors import SeedPolicy
-from torchrl_etdmpc.envs import Task, get_task, import_task, make_env, register_task
+from torchrl_etdmpc.envs import Task, import_task, make_env, register_task
 from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.envs.tasks import Maker, registered_maker
 from torchrl_etdmpc.envs.worker import signals_held_back, take_signals
@@ -84,15 +84,15 @@ class WorkerParts:
         sizes (tuple of int): O and A.
         discount (float): of the planner.
         compile_mode (str, optional): of the planner. Default: ``None``, eager.
-        registered (tuple of Task and callable, optional): the task's entry and maker, where the owner has registered
-            one. Default: ``None``.
+        registered (tuple of Task and callable, optional): the task's entry, and its maker if the program has registered
+            one; not of a task that is imported by its name. Default: ``None``.
     """
 
     config: TrainConfig
     sizes: tuple[int, int]
     discount: float
     compile_mode: str | None = None
-    registered: tuple[Task, Maker] | None = None
+    registered: tuple[Task, Maker | None] | None = None
 
     def make_env(self, number: int) -> EnvBase:
         """The environment of one worker, whose rows carry its number.
@@ -117,19 +117,18 @@ class WorkerParts:
         return Actor(planner, hold=config.replay.seed_hold)
 
     def _prepare(self) -> None:
-        """Imports what the command line has made the owner import, and registers what its program has."""
+        """Imports what the command line has made the owner import, and registers what its program may have."""
         config = self.config
         if self.registered is not None:
             register_task(*self.registered, replace=True)
-        elif ":" in config.task:
+        if ":" in config.task:
             import_task(config.task, **{name: getattr(config, name) for name in TASK_SETTINGS})
         follow_own_code("planner.score", config.planner.score)
 
 
-def registered_by_the_program(config: TrainConfig) -> tuple[Task, Maker] | None:
-    """The task's entry and maker, if this process has registered one that no import would bring back."""
-    make = None if ":" in config.task else registered_maker(config.task_spec)
-    return None if make is None else (get_task(config.task), make)
+def known_here(config: TrainConfig) -> tuple[Task, Maker | None] | None:
+    """What this process knows of the task and another may not; ``None`` where its name says what to import."""
+    return None if ":" in config.task else (config.task_spec, registered_maker(config.task_spec))
 
 
 class _Processes(MultiAsyncCollector):
