@@ -210,10 +210,29 @@ def test_what_is_unavailable_is_a_dash_on_the_page_empty_in_csv_and_explained(wi
     assert "nan" not in page.lower()
 
 
+def test_without_an_area_on_all_tasks_there_is_no_figure_of_areas(without_figures, tmp_path):
+    steps = {"walker-walk": (50_000, 60_000), "walker-run": (60_000,)}
+    late = [("ours", task, seed, step, step / 1000) for task in TASKS for seed in (0, 1) for step in steps[task]]
+    bmpc = [("BMPC", task, step, step / 2000, 2.0, 5) for task in TASKS for step in STEPS]
+    found = compare(
+        pd.DataFrame(late, columns=["method", "task", "seed", "env_steps", "return_mean"]),
+        pd.DataFrame(bmpc, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"]),
+        benchmark=get_benchmark("dmc-easy"),
+        tasks=TASKS,
+        budget=60_000,
+        grid_step=10_000,
+    )
+    (tmp_path / "auc.png").write_text("of an earlier report")
+    page = write_report(found, tmp_path).read_text(encoding="utf-8")
+    assert set(contents(tmp_path)) == FILES - {"auc.png"}
+    assert "(aggregate.png)" in page and "(auc.png)" not in page
+
+
 def test_methods_known_per_seed_on_all_tasks_have_an_interquartile_mean_on_the_page(without_figures, tmp_path):
     page = write_report(comparison(seeds=2), tmp_path / "report").read_text(encoding="utf-8")
-    (row,) = re.findall(r"^\| ours \| ([\d.]+) \(([\d.]+) to ([\d.]+)\) \|  \| 2 \|$", page, re.MULTILINE)
+    (row,) = re.findall(r"^\| ours \| ([\d.]+) \(([\d.]+) to ([\d.]+)\) \| 2 \|$", page, re.MULTILINE)
     assert np.array(row, float) == pytest.approx([1.005, 1.0, 1.01])
+    assert "P is the probability" not in page  # there is no second method
     assert "Interquartile mean" not in write_report(comparison(short=True), tmp_path / "other").read_text("utf-8")
 
 

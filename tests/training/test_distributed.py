@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import itertools
 import math
 import os
 import signal
@@ -215,8 +216,22 @@ def test_first_episodes_that_are_cut_early_are_told_however_many_workers_play(st
     learner = learner_of(config_of(workers=3))
     for _ in range(3):
         learner.step()
-    with pytest.warns(UserWarning, match="truncated within its first 10 env steps, but its time limit is sai"):
+    with pytest.warns(UserWarning, match="truncated within its first 16 env steps, but its time limit is sai"):
         learner.step()
+    learner.collector.shutdown()
+
+
+def test_an_episode_of_full_length_is_not_told_where_one_worker_comes_first(started, monkeypatch):
+    def one_after_the_other(workers: Workers) -> Iterator[TensorDictBase]:
+        for worker in workers.workers:
+            yield from itertools.islice(worker, 3)
+
+    monkeypatch.setattr(Workers, "__iter__", one_after_the_other)
+    started()
+    learner = learner_of(config_of())
+    for _ in range(6):  # with warnings as errors
+        learner.step()
+    assert learner.replay[:]["next", "truncated"].flatten().nonzero().flatten().tolist() == [19, 24 + 19]
     learner.collector.shutdown()
 
 

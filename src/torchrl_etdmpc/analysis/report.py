@@ -31,7 +31,7 @@ from torchrl_etdmpc.analysis.tables import AGGREGATE, escape, result_table, to_c
 from torchrl_etdmpc.runs.files import replacing
 
 FIGURES = ("curves", "aggregate", "auc")
-"""The last two only where something normalises the tasks."""
+"""The last two only where something normalises the tasks, the last one where a method has an area on all of them."""
 
 
 def write_report(
@@ -111,6 +111,10 @@ def _normalised(comparison: Comparison) -> bool:
     return any(task in comparison.constants.index for task in comparison.tasks)
 
 
+def _aggregate_areas(comparison: Comparison) -> pd.DataFrame:
+    return comparison.areas[comparison.areas["task"] == AGGREGATE]
+
+
 def _tables(comparison: Comparison) -> dict[str, str]:
     areas, finals = _wide(comparison, comparison.areas, "auc"), _wide(comparison, comparison.finals, "mean")
     files = {
@@ -146,16 +150,15 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     curves = aggregate(normalise(interpolate(comparison.estimates, steps), comparison.constants), comparison.tasks)
     points = comparison.points.assign(standard_error=np.nan, seeds=np.nan)
     points = aggregate(normalise(points, comparison.constants), comparison.tasks)
-    areas = comparison.areas[comparison.areas["task"] == AGGREGATE]
+    areas = _aggregate_areas(comparison)
     options = {"methods": comparison.methods, "budget": comparison.budget}
     learned = plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options)
-    if not _normalised(comparison):
-        return {"curves": learned}
-    return {
-        "curves": learned,
-        "aggregate": plot_aggregate(curves, ylabel=normalised, points=points, **options),
-        "auc": plot_auc(areas, methods=comparison.methods, ylabel="normalised AUC"),
-    }
+    figures = {"curves": learned}
+    if _normalised(comparison):
+        figures["aggregate"] = plot_aggregate(curves, ylabel=normalised, points=points, **options)
+    if areas["auc"].notna().any():
+        figures["auc"] = plot_auc(areas, methods=comparison.methods, ylabel="normalised AUC")
+    return figures
 
 
 def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[str]) -> str:
@@ -179,7 +182,7 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
         _paired(comparison),
         "## Area under the normalised learning curve\n",
         files["auc.md"],
-        "![areas](auc.png)\n" if _normalised(comparison) else "",
+        "![areas](auc.png)\n" if _aggregate_areas(comparison)["auc"].notna().any() else "",
         f"## Return at {comparison.budget:,} environment steps\n",
         "Of runs and published curves; the last row is the mean of normalised returns.\n",
         files["final.md"],
@@ -293,20 +296,24 @@ def _robust(comparison: Comparison) -> str:
     complete = {method: found for method, found in scores.items() if set(found) == set(comparison.tasks)}
     if not complete:
         return ""
-    others = " | ".join(f"P(> {escape(name)})" for name in complete)
+    pairs = list(complete) if len(complete) > 1 else []
+    probability = (
+        "P is the probability that a run of the row's method scores more than one of the column's, averaged over "
+        "tasks. "
+    )
+    header = ["method", "interquartile mean", *(f"P(> {escape(name)})" for name in pairs), "seeds per task"]
     lines = [
         f"## Interquartile mean of normalised scores at {comparison.budget:,} environment steps\n",
         "95% percentile intervals of a stratified bootstrap (2,000 resamples of the seeds within each task; narrower "
-        "than they should be where seeds are few); P is the "
-        "probability that a run of the row's method scores more than one of the column's, averaged over tasks. Only "
-        "methods whose runs are known per seed on all tasks.\n",
-        f"| method | interquartile mean | {others} | seeds per task |",
-        "|---" * (len(complete) + 3) + "|",
+        f"than they should be where seeds are few). {probability if pairs else ''}Only methods whose runs are known "
+        "per seed on all tasks.\n",
+        f"| {' | '.join(header)} |",
+        "|---" * len(header) + "|",
     ]
     for method, found in complete.items():
         cells = [_quote(interquartile_mean(found))]
         cells += [
-            "" if other == method else _quote(probability_of_improvement(found, complete[other])) for other in complete
+            "" if other == method else _quote(probability_of_improvement(found, complete[other])) for other in pairs
         ]
         counts = sorted({len(values) for values in found.values()})
         seeds = " to ".join(map(str, counts[:: max(len(counts) - 1, 1)]))

@@ -148,6 +148,11 @@ class StepCollector(BaseCollector):
         return self._frames
 
     @property
+    def decisions_each(self) -> int:
+        """Decisions made so far, of every environment."""
+        return self._frames // self.num_envs
+
+    @property
     def in_seed_phase(self) -> bool:
         """Whether the next decision belongs to the random phase."""
         return self._frames < self.init_random_frames

@@ -104,9 +104,10 @@ class RunLog:
         """
         counters = _counters(env_steps, decision_steps, updates, wall_time_s)
         self._append("eval", results, counters)
+        episodes = results["episodes"]
         torchrl_logger.info(
             f"env_steps={env_steps} of {self.total_env_steps}: return {float(results['return_mean']):.1f} "
-            f"+- {float(results['return_std']):.1f} over {results['episodes']} episodes"
+            f"+- {float(results['return_std']):.1f} over {episodes} episode{'s' * (episodes != 1)}"
         )
 
     def finish(self, summary: Mapping[str, Any]) -> Path:

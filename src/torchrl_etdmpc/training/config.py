@@ -379,11 +379,6 @@ class TrainConfig:
         return self.num_envs
 
     @property
-    def simulators(self) -> int:
-        """How many play at the same time."""
-        return self.num_envs
-
-    @property
     def total_decisions(self) -> int:
         """The budget in decisions, all environments together."""
         return -(-self.total_env_steps // self.task_spec.action_repeat)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -92,11 +92,6 @@ class DistributedConfig(TrainConfig):
         """Decisions that come together."""
         return self.rows_per_batch
 
-    @property
-    def simulators(self) -> int:
-        """One for each worker."""
-        return self.workers
-
 
 def is_distributed(settings: Any) -> bool:
     """Whether stored settings are those of a run of workers."""
@@ -157,11 +152,17 @@ class WorkerCollector:
         self._sent: dict[int, int] = {}  # by worker, the updates that its weights had
         self._last_worker: int | None = None
         self._ends: dict[int, TensorDictBase] = {}  # by worker, the last row that came from it
+        self._played: Counter[int] = Counter()  # by worker, the rows that came from it
 
     @property
     def frames(self) -> int:
         """Decisions so far that were stored."""
         return self._frames
+
+    @property
+    def decisions_each(self) -> int:
+        """Decisions of the worker that has made most, since the workers were started."""
+        return max(self._played.values(), default=0)
 
     @property
     def in_seed_phase(self) -> bool:
@@ -201,6 +202,7 @@ class WorkerCollector:
         self._check_continuous(rows)
         self._arrived = True
         self._last_worker = int(rows[WORKER][0])
+        self._played[self._last_worker] += len(rows)
         planned = rows[PLAN, VERSION]
         rows[WEIGHT_AGE] = torch.where(planned > 0, self.agent.updater.updates - planned, -1)
         self.replay_buffer.extend(rows.exclude(WEIGHT_AGE, *self.exclude_keys))
@@ -220,7 +222,7 @@ class WorkerCollector:
         self._numbers = range(self._next_number, self._next_number + config.workers)
         self._next_number += config.workers
         self._last_worker = None
-        self._ends = {}
+        self._ends, self._played = {}, Counter()
         torchrl_logger.info(f"starting {config.workers} workers")
         self._workers = start_workers(parts, engine=config.engine, numbers=self._numbers, rows=config.rows_per_batch)
         self._planning = not self.in_seed_phase

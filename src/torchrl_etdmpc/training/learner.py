@@ -134,7 +134,7 @@ class Learner:
 
     def _note_limit(self, truncated: Tensor | None) -> None:
         """Says once that first episodes are cut before the time limit that the discount is chosen by."""
-        task, decisions = self.config.task_spec, self.collector.frames // self.config.simulators
+        task, decisions = self.config.task_spec, self.collector.decisions_each
         if truncated is not None and decisions < task.decision_steps_per_episode and truncated.any():
             self._limit_noted = True
             warnings.warn(
