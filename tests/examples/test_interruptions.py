@@ -30,7 +30,7 @@ from torchrl_etdmpc.training import EXIT_CODE  # noqa: E402
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
 COMMAND = (
-    "preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=400 log_every=40 "
+    "preset=cpu seed=3 device=cpu threads=1 compile=off total_env_steps=300 log_every=40 "
     "task.episode_length=200 eval_every=150 eval_episodes=1 checkpoint_every=30 "
     "model.latent_dim=16 model.mlp_dim=16 model.encoder_dim=16 "
     "planner.horizon=2 planner.num_samples=8 planner.num_elites=4 planner.num_proposals=2 planner.iterations=1 "
@@ -127,9 +127,9 @@ def test_a_run_on_a_task_that_terminates_is_exact_too(num_envs, tmp_path, train)
     pytest.importorskip("mujoco")
     (tmp_path / "straight").mkdir()
     (tmp_path / "killed").mkdir()
-    task = "gym/InvertedPendulum-v5"
-    finish(train(tmp_path / "straight", "run_dir=run", f"num_envs={num_envs}", task=task))
-    kill_and_go_on(train, tmp_path / "killed", 2, 0, f"num_envs={num_envs}", task=task)
+    task, *arguments = "gym/InvertedPendulum-v5", f"num_envs={num_envs}", f"total_env_steps={num_envs * 180}"
+    finish(train(tmp_path / "straight", "run_dir=run", *arguments, task=task))
+    kill_and_go_on(train, tmp_path / "killed", 2, 0, *arguments, task=task)
     straight = results(tmp_path / "straight" / "run")
     assert results(tmp_path / "killed" / "run") == straight
     assert sum(flag for (flag,) in straight["replay"]["('next', 'terminated')"]) > 10  # the head had something to learn
