@@ -645,6 +645,11 @@ def test_collection_is_reproducible_by_set_seed_and_torch_manual_seed():
     assert not torch.equal(stored[0]["observation"][0], stored[2]["observation"][0])
 
 
+def test_a_static_seed_reaches_the_environment():
+    collector = StepCollector(make_env(), RandomActions(), replay_buffer=make_replay())
+    assert collector.set_seed(7, static_seed=True) == 7 != collector.set_seed(7)
+
+
 @pytest.mark.parametrize("insertion", ["step", "episode"])
 def test_an_episode_that_a_seed_abandons_never_continues(insertion):
     replay = make_replay()
@@ -764,6 +769,19 @@ def test_ends_that_faults_made_are_made_again_in_a_buffer_that_was_saved_before(
     rows, _ = buffer.sampler.sample(buffer.storage, 300)
     torch.manual_seed(0)
     assert torch.equal(other.sampler.sample(other.storage, 300)[0], rows)
+
+
+def test_going_back_forgets_the_ends_that_faults_made_since(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.load_simulator_state", lambda *_: True)
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: {})
+    collector = StepCollector(make_env((9,)), RandomActions(), replay_buffer=make_replay())
+    collector.step()
+    state = collector.state_dict()
+    collector.step()
+    collector._truncate_episodes()  # as a fault does
+    assert collector.state_dict()["ended_rows"]
+    collector.load_state_dict(state)
+    assert collector.state_dict()["ended_rows"] == {}
 
 
 def test_a_row_that_was_written_over_is_not_ended_by_the_fault_of_an_older_episode(monkeypatch):

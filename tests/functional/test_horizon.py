@@ -355,3 +355,13 @@ def test_a_depth_that_is_beta_deviations_ahead_of_a_certain_one_is_worth_as_much
     value, weights = adaptive_mixture(mean, torch.stack([torch.full_like(std, 1e-4), std], -1), beta)
     torch.testing.assert_close(value, torch.zeros_like(std), atol=1e-3, rtol=0)
     torch.testing.assert_close(weights.sum(-1), torch.ones_like(std))
+
+
+@pytest.mark.parametrize("certain", [0, 1])
+def test_what_is_left_of_a_depth_that_is_all_but_given_up_counts_in_float32(certain):
+    # w mean - beta sqrt(s^2 + w^2 r^2), w and r of the uncertain depth, s the floor, is at most -beta s sqrt(3/4).
+    mean, std = torch.full((2,), 1000.0), torch.full((2,), 200.0)
+    mean[certain] = std[certain] = 0.0
+    value, weights = adaptive_mixture(mean, std, 10.0)
+    assert value.item() == pytest.approx(-10 * SIGMA_FLOOR * math.sqrt(1 - 0.5**2), rel=1e-3)
+    assert weights[1 - certain].item() > 0

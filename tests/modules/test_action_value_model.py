@@ -93,6 +93,12 @@ def test_both_policies_answer_alike():
     assert (mean.abs() < 1).all()
 
 
+def test_a_squashed_policy_keeps_the_bounds_that_a_call_asks_for():
+    policy = SquashedGaussianPolicy(L, A, hidden_dim=8)
+    torch.nn.init.zeros_(policy.output.weight)  # halfway between the bounds, and at a mean of 0 tanh has a slope of 1
+    assert policy(torch.zeros(1, L), (-1.0, -0.5))[1].tolist() == [[-0.75] * A]
+
+
 def test_the_deviation_of_a_squashed_policy_is_that_of_its_actions():
     torch.manual_seed(0)
     policy = SquashedGaussianPolicy(L, A, hidden_dim=8, log_std_min=-6.0, log_std_max=-5.0).double()

@@ -196,3 +196,22 @@ def test_a_target_encoder_standardises_as_the_encoder_does(make_world_model, mak
     for name, statistic in model.encoder.norm.named_buffers():
         assert torch.equal(targets[f"norm.{name}"], statistic), name
     assert targets["norm.mean"].min() > 40
+
+
+def test_a_target_encoder_standardises_by_what_was_seen_before_the_batch():
+    seen = []
+
+    def look(world_model, slices, rollout):
+        seen.append(rollout.targets["encoder"]["norm.mean"].clone())
+        return torch.zeros(slices.action.shape[:2])
+
+    term = Term("look", look, networks=("encoder",), targets=("encoder",))
+    world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32, normalize_observations=True)
+    loss = EfficientTDMPCLoss(world_model, discount=0.99, extra_terms=[term])
+    SoftUpdate(loss, tau=0.01)
+    slices = random_slices(3, 2)
+    slices["observation"] += 50
+    slices["next", "observation"] += 50
+    for _ in range(2):
+        loss(slices)
+    torch.testing.assert_close(torch.stack(seen), torch.stack([torch.zeros(3), slices["observation"][:, 0].mean(0)]))

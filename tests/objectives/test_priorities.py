@@ -61,6 +61,15 @@ def test_masks_and_weights_go_together(make_loss, kind, world_model, slices, run
         torch.testing.assert_close(out[key], (plain[key] * weights).sum() / weights.sum())
 
 
+def test_slices_that_count_for_nothing_are_a_loss_of_zero(make_loss, kind, world_model, slices, run_seeded, terms_of):
+    loss = make_loss(kind, world_model).eval()
+    for weight, counts in ((1.0, False), (0.0, True)):
+        slices["priority_weight"] = torch.full((4, 3), weight)
+        slices["collector", "mask"] = torch.full((4, 3), counts)
+        out = run_seeded(loss, slices)
+        assert [out[f"loss_{term}"].item() for term in terms_of[kind]] == [0] * len(terms_of[kind])
+
+
 def test_the_weights_can_be_left_aside(loss, slices, run_seeded, assert_same_output):
     expected = run_seeded(loss.eval(), slices)
     loss.use_prioritized_weights = False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -170,3 +172,16 @@ def test_policy_and_planner_are_exported(make_planner, states):
     plan = planner.plan(observation[:1], torch.zeros(1, 3, 2).double(), explore=False)
     torch.testing.assert_close(exported, plan.action)
     torch.testing.assert_close(mean, plan.mean)
+
+
+@torch.no_grad()
+def test_an_end_that_is_expected_takes_its_share_of_the_values_of_actions(make_planner, states):
+    model = make_model(termination=True)
+    for head in (model.reward_head, model.value_head, model.termination_head):
+        nn.init.zeros_(head.output.weight)  # a reward of 0, and an end with probability 1/2 in every state
+        nn.init.zeros_(head.output.bias)
+    model.value_head.output.bias[..., 55] = 100  # symlog 1: worth e - 1
+    planner = make_planner(model, horizon=2, discount=0.9, score="mean")
+    returns = planner.plan(states(2), trace=True).trace.returns
+    worth = torch.tensor([0.9 / 2, 0.9**2 / 4], dtype=torch.float64) * math.expm1(1)
+    torch.testing.assert_close(returns, worth.view(2, 1, 1).expand_as(returns))

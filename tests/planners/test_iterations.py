@@ -155,8 +155,9 @@ def test_plans_repeat_with_the_global_seed(make_planner, states, run):
     assert not torch.equal(run(planner, td, seed=5)["plan", "loc"], run(planner, td, seed=6)["plan", "loc"])
 
 
-def test_a_generator_draws_the_noise_and_leaves_the_global_one_alone(make_planner):
-    planner = make_planner()
+@pytest.mark.parametrize("kind", [WorldModel, ActionValueWorldModel])
+def test_a_generator_draws_the_noise_and_leaves_the_global_one_alone(make_planner, kind):
+    planner = make_planner(kind(3, 2, latent_dim=16, mlp_dim=16).double())
     state = torch.get_rng_state()
     first, second = (planner.draw_noise(3, generator=torch.Generator().manual_seed(1)) for _ in range(2))
     planner.plan(torch.zeros(3, 3, dtype=torch.float64), noise=first)

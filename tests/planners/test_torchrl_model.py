@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, ModelBasedEnvBase
@@ -139,6 +139,9 @@ def test_values_and_ends_are_those_that_are_given():
     value = TensorDictModule(lambda place: 3 * place, in_keys=["place"], out_keys=["state_value"])
     latent = torch.tensor([[2.0, 0.0], [1.0, 5.0]])
     assert make(wrapper(), values=value).values(latent).tolist() == [[6.0], [3.0]]
+    hidden = TensorDictModule(lambda place: 2 * place, in_keys=["place"], out_keys=["within"])
+    value = TensorDictModule(lambda within: within + 1, in_keys=["within"], out_keys=["state_value"])
+    assert make(wrapper(), values=TensorDictSequential(hidden, value)).values(latent).tolist() == [[5.0], [3.0]]
     model = make(wrapper(), values=lambda z: z, termination=lambda z: (z[..., 1] > 1).float())
     assert model.values(latent).shape == (2, 2)
     assert model.termination(latent).tolist() == [0.0, 1.0]

@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections import defaultdict
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -895,3 +896,41 @@ def test_rows_are_drawn_whatever_the_default_device_is(capacity):
     finally:
         torch.set_default_device(None)
     assert (drawn.diff(dim=1) == 1).all()
+
+
+def test_rows_that_were_written_past_the_sampler_are_noticed_when_a_loaded_buffer_was_added_to():
+    def row(step: int) -> TensorDict:
+        return TensorDict({"t": torch.tensor(step), "collector": {"traj_ids": torch.tensor(0)}})
+
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=StepSliceSampler(3), batch_size=30)
+    for step in range(33):
+        buffer.add(row(step))
+    buffer.load_state_dict(copy.deepcopy(buffer.state_dict()))
+    buffer.add(row(33))
+    buffer.sample()
+    buffer.storage.set(0, buffer.storage[0])  # somebody else
+    with pytest.raises(RuntimeError, match="others have written to the full storage"):
+        buffer.sample()
+
+
+def first_steps(mask: torch.Tensor, end: int | None = None) -> tuple[TensorDictReplayBuffer, Callable[[], list[int]]]:
+    """A buffer of one episode, and what gives the steps that partial slices of it begin at."""
+    rows = TensorDict({"t": torch.arange(len(mask)), "next": {"done": torch.zeros(len(mask), 1, dtype=torch.bool)}})
+    rows["collector"] = {"traj_ids": torch.zeros(len(mask), dtype=torch.int64), "mask": mask}
+    if end is not None:
+        rows["next", "done"][end] = True
+    sampler = StepSliceSampler(3, partial=True)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=sampler, batch_size=900)
+    buffer.extend(rows.auto_batch_size_(1))
+    return buffer, lambda: buffer.sample()["t"].reshape(-1, 3)[:, 0].unique().tolist()
+
+
+def test_the_last_steps_of_an_episode_begin_slices_from_the_moment_that_it_is_ended():
+    buffer, begins = first_steps(torch.ones(6, dtype=torch.bool))
+    assert begins() == [0, 1, 2, 3]  # it goes on
+    buffer.sampler.end_episodes(torch.tensor([5]), buffer.storage)
+    assert begins() == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_last_steps_before_padding_begin_slices():
+    assert first_steps(torch.arange(6) < 4, end=3)[1]() == [0, 1, 2, 3]
