@@ -12,6 +12,11 @@ from torchrl_etdmpc.testing import LineWorld
 _MODES = ("elite", "mean", "best")
 
 
+def test_training_draws_an_elite_and_evaluation_takes_the_best_unless_told_otherwise(make_planner):
+    planner = make_planner()
+    assert (planner.first_action, planner.eval_first_action) == ("elite", "best")
+
+
 @pytest.mark.parametrize("mode", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
 def test_without_exploration_the_action_is_the_mean_of_the_target(mode, make_planner, states):
     planner = make_planner(eval_first_action="elite")

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import RSSMPrior, WorldModel, WorldModelWrapper
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv
@@ -133,6 +134,22 @@ def test_an_imagined_rollout_follows_the_plan(adapted):
     with torch.no_grad():
         rollout = env.rollout(4, planner)
     assert rollout["next", "latent"][-1, 0] == pytest.approx(GOAL, abs=0.1)
+
+
+def test_a_prediction_is_no_sample_however_the_agent_explores():
+    seen = []
+
+    class Watched(Move):
+        def forward(self, place: Tensor, mark: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+            seen.append(exploration_type())
+            return super().forward(place, mark, action)
+
+    states = ["place", ("hidden", "mark")]
+    move = TensorDictModule(Watched(), in_keys=[*states, "action"], out_keys=states)
+    model = make(WorldModelWrapper(move, TensorDictModule(rewarded, in_keys=["place"], out_keys=["reward"])))
+    with set_exploration_type(ExplorationType.RANDOM):
+        model.next(torch.zeros(1, 2), torch.zeros(1))
+    assert set(seen) == {ExplorationType.DETERMINISTIC}
 
 
 def test_values_and_ends_are_those_that_are_given():
