@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-# Of a `make test` around them.
+# Nothing of a `make test` around them.
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
 
 

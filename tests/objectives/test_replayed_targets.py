@@ -7,19 +7,10 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from torchrl.objectives import SoftUpdate
 
 from torchrl_etdmpc.functional import two_hot_encode
 from torchrl_etdmpc.modules import WorldModel
-from torchrl_etdmpc.objectives import (
-    EfficientTDMPCLoss,
-    LatentRollout,
-    Term,
-    imagined_value_target,
-    replayed_value_target,
-    value_error,
-)
-from torchrl_etdmpc.testing import random_slices
+from torchrl_etdmpc.objectives import LatentRollout, Term, imagined_value_target, replayed_value_target, value_error
 
 DISCOUNT = 0.99
 
@@ -131,22 +122,13 @@ def test_values_of_equally_frequent_targets_settle_at_their_expectile(expectile)
     torch.testing.assert_close(value, torch.full((2,), math.expm1(expectile * math.log(101))), rtol=1e-4, atol=0)
 
 
-def test_a_term_that_reads_ends_does_not_end_what_is_replayed():
+def test_a_term_that_reads_ends_does_not_end_what_is_replayed(make_loss, make_slices, run_seeded):
     term = Term("ends", lambda world_model, slices, rollout: slices.terminated.float(), keys=("terminated",))
-    found = []
+    slices, found = make_slices(), []
+    slices["next", "terminated"][:] = True
     for terms in ([], [term]):
         torch.manual_seed(0)
-        world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
-        with torch.no_grad():
-            for parameter in world_model.parameters():
-                parameter.add_(0.3 * torch.randn_like(parameter))
-        loss = EfficientTDMPCLoss(
-            world_model, discount=DISCOUNT, value_replayed=1.0, ignore_termination=True, extra_terms=terms
-        )
-        SoftUpdate(loss, tau=0.01)
-        slices = random_slices(3, 2, terminated=True)
-        slices["next", "terminated"][:] = True
-        torch.manual_seed(0)
-        found.append(loss.eval()(slices)["value_target"])
+        loss = make_loss(value_replayed=1.0, ignore_termination=True, extra_terms=terms)
+        found.append(run_seeded(loss.eval(), slices)["value_target"])
     assert torch.equal(*found)
     assert not torch.isclose(found[0], slices["next", "reward"].mean(), atol=1e-2)  # as it were with ends

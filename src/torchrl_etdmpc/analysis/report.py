@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -71,7 +71,7 @@ def write_report(
     files = _tables(comparison)
     with matplotlib.rc_context({"text.parse_math": False}):  # a name may hold any sign
         figures = _figures(comparison)
-    files["index.md"] = _page(comparison, files, incomplete)
+    files["index.md"] = _page(comparison, files, figures, incomplete)
     contents = {name: text.encode() for name, text in files.items()}
     for name, figure in figures.items():
         for ending in filter(None, ("png", vector)):
@@ -111,10 +111,6 @@ def _normalised(comparison: Comparison) -> bool:
     return any(task in comparison.constants.index for task in comparison.tasks)
 
 
-def _aggregate_areas(comparison: Comparison) -> pd.DataFrame:
-    return comparison.areas[comparison.areas["task"] == AGGREGATE]
-
-
 def _tables(comparison: Comparison) -> dict[str, str]:
     areas, finals = _wide(comparison, comparison.areas, "auc"), _wide(comparison, comparison.finals, "mean")
     files = {
@@ -150,7 +146,7 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     curves = aggregate(normalise(interpolate(comparison.estimates, steps), comparison.constants), comparison.tasks)
     points = comparison.points.assign(standard_error=np.nan, seeds=np.nan)
     points = aggregate(normalise(points, comparison.constants), comparison.tasks)
-    areas = _aggregate_areas(comparison)
+    areas = comparison.areas[comparison.areas["task"] == AGGREGATE]
     options = {"methods": comparison.methods, "budget": comparison.budget}
     learned = plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options)
     figures = {"curves": learned}
@@ -161,7 +157,7 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     return figures
 
 
-def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[str]) -> str:
+def _page(comparison: Comparison, files: dict[str, str], figures: Collection[str], incomplete: Sequence[str]) -> str:
     benchmark, grid = comparison.benchmark, comparison.grid
     count, total = len(comparison.tasks), len(benchmark.tasks)
     scope = f"all {total} tasks" if count == total else f"{count} of its {total} tasks, over which aggregates are taken"
@@ -182,7 +178,7 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
         _paired(comparison),
         "## Area under the normalised learning curve\n",
         files["auc.md"],
-        "![areas](auc.png)\n" if _aggregate_areas(comparison)["auc"].notna().any() else "",
+        "![areas](auc.png)\n" if "auc" in figures else "",
         f"## Return at {comparison.budget:,} environment steps\n",
         "Of runs and published curves; the last row is the mean of normalised returns.\n",
         files["final.md"],
@@ -192,7 +188,7 @@ def _page(comparison: Comparison, files: dict[str, str], incomplete: Sequence[st
         "the trained agent; a marker at 0 is the untrained one. Hollow markers are quoted, and belong to no line. The "
         "aggregate has what is known on every task; a single value is a marker with its interval.\n",
         "![learning curves](curves.png)\n",
-        "![aggregate](aggregate.png)\n" if _normalised(comparison) else "",
+        "![aggregate](aggregate.png)\n" if "aggregate" in figures else "",
         _intervals(comparison),
         _robust(comparison),
     ]
