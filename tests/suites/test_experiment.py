@@ -158,6 +158,7 @@ def test_settings_of_the_command_come_after_those_of_every_variant(write):
         ({"settings": [1]}, r"settings of .*mine.yaml must be settings by name, got \[1\]."),
         ({"budget": "much"}, "budget of .* must be a number of env steps or 'benchmark', got 'much'."),
         ({"budget": -1}, "budget of .* must be a number of env steps or 'benchmark', got -1."),
+        ({"budget": 1000.5}, "budget of .* must be a number of env steps or 'benchmark', got 1000.5."),
         ({"base": "three"}, "base of experiment mine must be one of one, two heads, got 'three'."),
         ({"what": 1}, "mine.yaml has an unknown entry what; known: base, budget, seeds, "),
     ],
@@ -365,6 +366,16 @@ def test_a_search_may_have_more_trials_but_no_other_space_tasks_seeds_or_budget(
     ):
         with pytest.raises(ValueError, match="was begun in .* for the search 'a', whose trials would not compare"):
             extended(stored, read_experiment(write(**changes, base=None)), tmp_path)
+
+
+@pytest.mark.parametrize("left_out", [False, True])
+def test_what_all_trials_of_a_search_share_may_not_change(write, tmp_path, left_out):
+    variants = {"a": {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 2}}
+    stored = read_experiment(write(variants=variants, base=None))
+    settings = {"preset": "cpu", "planner.horizon": 5}
+    asked = read_experiment(write(variants={"b": {}} if left_out else variants, settings=settings, base=None))
+    with pytest.raises(ValueError, match="with planner.horizon=4 for variant 'a', now it is 5; choose"):
+        extended(stored, asked, tmp_path)
 
 
 def test_a_search_goes_on_with_its_tasks_and_seeds_in_another_order(write, tmp_path):

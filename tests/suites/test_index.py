@@ -146,6 +146,22 @@ def test_long_tables_are_read_from_their_end(runs, small):
     assert read_progress(runs[0]).decisions_per_second == pytest.approx(4.0)
 
 
+def test_a_column_may_have_a_name_of_any_letters(runs, small):
+    small.write_tables(runs[0], 200)
+    rows = "".join(f"{i},{i},0,{i / 4},0\n" for i in range(5))
+    table = runs[0].path / "train.csv"
+    table.write_text(f"env_steps,decision_steps,updates,wall_time_s,loss_größe\n{rows}", encoding="utf-8")
+    assert read_progress(runs[0]).decisions_per_second == pytest.approx(4.0)
+
+
+def test_a_row_that_the_end_of_a_table_begins_with_is_cut_and_says_nothing_of_the_speed(runs, small):
+    small.write_tables(runs[0], 200)
+    head = "env_steps,decision_steps,updates,wall_time_s,metrics\n"
+    rows = (f"{i},{i},0,{i / 4},{'9' * 1500}\n" for i in range(20))  # five of them are read
+    (runs[0].path / "train.csv").write_text(head + "".join(rows))
+    assert read_progress(runs[0]).decisions_per_second == pytest.approx(4.0)
+
+
 # -- the index --------------------------------------------------------------------------------------------------------
 
 

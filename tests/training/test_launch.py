@@ -18,6 +18,7 @@ from torchrl_etdmpc.checkpoints import CheckpointStore
 from torchrl_etdmpc.collectors import StepCollector
 from torchrl_etdmpc.envs import Task, register_task
 from torchrl_etdmpc.runs import RunDirectory, RunLog
+from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.training import (
     Evaluator,
     RunInterrupted,
@@ -214,6 +215,25 @@ def test_a_command_may_repeat_a_setting_of_the_run_but_not_change_it(command):
         "planner.horizon=3 was asked for, but this run was started with planner.horizon=2; leave it out to go on, or "
         "start a new run_dir."
     )
+
+
+def test_every_setting_that_a_result_depends_on_must_stay(command):
+    saved = command()
+    free = {"resume", "run_dir", "total_env_steps", "device", "threads", "compile", "logger"}
+    free |= {"checkpoint_every", "checkpoint_minutes", "checkpoint_keep"}
+    for name in flat(saved.to_dict()).keys() - free:
+        with pytest.raises(ValueError, match=f"=another was asked for, but this run was started with .*{name}="):
+            resumed_config(saved, {name: "another"}, [name])
+
+
+def test_a_setting_of_the_task_has_two_names_and_what_is_none_is_refused(command):
+    saved = command()
+    for name in ("action_repeat", "task.action_repeat"):
+        with pytest.raises(ValueError, match=r"^task\.action_repeat=7 was asked for, but this run was started with "):
+            resumed_config(saved, {"action_repeat": 7}, [name])
+    for name in ("planner.horizont", "planner"):
+        with pytest.raises(ValueError, match=f"^explicit names {name}, which is no setting; "):
+            resumed_config(saved, saved, [name])
 
 
 def test_settings_that_a_command_does_not_name_are_the_run_s_before_anything_is_checked(command):
@@ -465,6 +485,22 @@ def test_a_signal_before_the_first_step_leaves_nothing_behind(command, tmp_path,
         launch(command())
     assert list(tmp_path.iterdir()) == []
     assert not went_on
+
+
+@needs_dm_control
+def test_the_environment_begins_with_the_seed_of_the_run(command, monkeypatch, process):
+    module, seeds = importlib.import_module("torchrl_etdmpc.training.launch"), []
+    make_env = module.make_env
+
+    def watched(*args: Any, **options: Any) -> Any:
+        seeds.append(options.get("seed"))
+        return make_env(*args, **options)
+
+    monkeypatch.setattr(module, "make_env", watched)
+    monkeypatch.setattr(TrainingRun, "run", lambda run: kill())
+    with pytest.raises(Killed):
+        launch(command(seed=7))
+    assert seeds == [7, None]  # evaluations have a seed of their own
 
 
 @needs_dm_control

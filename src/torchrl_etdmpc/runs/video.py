@@ -17,7 +17,7 @@ _GIF_FPS, _GIF_COLOURS = 12.5, 64  # a GIF takes a multiple of 10 ms per picture
 
 
 def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathLike[str], fps: float) -> Path:
-    """Writes an ``.mp4`` or, for pages that show no video, a ``.gif`` of at most 12.5 pictures per second.
+    """Writes an ``.mp4`` or, for pages that show no video, a ``.gif`` of about 12.5 pictures per second.
 
     Args:
         frames (iterable): as :func:`write_mp4` takes them.

@@ -396,16 +396,20 @@ def extended(stored: Experiment, asked: Experiment, folder: Path) -> Experiment:
         searches={**stored.searches, **asked.searches},
         base=asked.base or stored.base,
     )
-    for variant in stored.variants:
-        for task in stored.tasks:
-            old, new = (one.config(variant, task, stored.seeds[0]) for one in (stored, both))
+    for task in stored.tasks:
+        before, now = (
+            {name: one.config(name, task, stored.seeds[0]) for name in stored.variants} | dict(one.proposals(task))
+            for one in (stored, both)
+        )
+        for name, old in before.items():  # of a search the last point, which stands for all
+            new = now[name]
             changed = _changed(old, new)
             if new.total_env_steps < old.total_env_steps:
                 changed = f"total_env_steps={old.total_env_steps}", f"{new.total_env_steps}, which is less"
             if changed:
                 raise ValueError(
-                    f"experiment {asked.name} was begun in {folder} with {changed[0]} for variant {variant!r}, now it "
-                    f"is {changed[1]}; choose another runs_dir for the changed one."
+                    f"experiment {asked.name} was begun in {folder} with {changed[0]} for variant {name!r}, now it is "
+                    f"{changed[1]}; choose another runs_dir for the changed one."
                 )
     return both
 

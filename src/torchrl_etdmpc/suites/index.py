@@ -167,7 +167,7 @@ def last_rows(table: Path) -> list[dict[str, str]]:
     """The last whole rows of a table, without reading all of it."""
     try:
         with open(table, "rb") as file:
-            header = file.readline(_TAIL_BYTES).decode(errors="replace")
+            header = file.readline(_TAIL_BYTES)
             start = max(file.seek(0, os.SEEK_END) - _TAIL_BYTES, len(header))
             file.seek(start)
             text = file.read(_TAIL_BYTES).decode(errors="replace")
@@ -176,7 +176,7 @@ def last_rows(table: Path) -> list[dict[str, str]]:
     lines = text[: text.rfind("\n") + 1].splitlines()
     if start > len(header):
         lines = lines[1:]  # cut in the middle
-    return list(csv.DictReader([header, *lines]))
+    return list(csv.DictReader([header.decode(errors="replace"), *lines]))
 
 
 def _summary(file: Path) -> dict[str, Any]:

@@ -305,7 +305,8 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
             from the run.
 
     Raises:
-        ValueError: if the command names a setting with another value than the run's, and it may not change.
+        ValueError: if the command names a setting with another value than the run's, and it may not change, or what is
+            no setting.
 
     >>> from torchrl_etdmpc.training import preset
     >>> resumed_config(preset("cpu"), {"total_env_steps": 100_000}, ["total_env_steps"]).total_env_steps
@@ -313,13 +314,17 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
     """
     values = flat(saved.to_dict())
     wanted = flat(asked.to_dict() if isinstance(asked, TrainConfig) else asked)
-    for name in explicit:
+    known = {typed_name(name): name for name in values} | {name: name for name in values}
+    for named in explicit:
+        if named not in known:
+            raise ValueError(f"explicit names {named}, which is no setting; name one, e.g. planner.horizon.")
+        name = known[named]
         if name in CHANGEABLE:
             values[name] = wanted[name]
-        elif values.get(name) != wanted.get(name):
+        elif values[name] != wanted.get(name):
             raise ValueError(
                 f"{typed_name(name)}={wanted.get(name)} was asked for, but this run was started with "
-                f"{typed_name(name)}={values.get(name)}; leave it out to go on, or start a new run_dir."
+                f"{typed_name(name)}={values[name]}; leave it out to go on, or start a new run_dir."
             )
     return type(saved).from_dict(_nested(values))
 
