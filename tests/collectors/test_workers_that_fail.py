@@ -65,6 +65,25 @@ def test_a_process_that_dies_or_hangs_costs_its_episodes_and_is_replaced(number,
     collector.shutdown()
 
 
+def test_new_processes_have_seeds_which_follow_from_the_random_numbers_of_the_run(monkeypatch):
+    class Workers:
+        is_closed, _owns_workers, _workers, parent_channels = False, True, (), ()
+
+        def start(self) -> None:
+            pass
+
+        def set_seed(self, seed: int) -> None:
+            seeds.append(seed)
+
+    monkeypatch.setattr("torchrl_etdmpc.envs.worker.ParallelEnv", Workers)
+    env, seeds = Workers(), []
+    for seed in (5, 5, 6):
+        torch.manual_seed(seed)
+        start_workers_anew(env)
+        env.is_closed = False
+    assert seeds[0] == seeds[1] != seeds[2]
+
+
 def test_what_is_no_number_names_its_environment():
     task = Task("faulty-pendulum", "mine", action_repeat=2, episode_length=1000, terminates=False)
     register_task(task, make_faulty, replace=True)

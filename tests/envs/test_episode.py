@@ -131,6 +131,19 @@ def test_an_episode_goes_on_to_its_own_end_and_into_the_next_ones(name, steps, r
     assert seen >= resets
 
 
+def test_a_bookmark_leads_back_from_behind_the_end_of_an_episode():
+    env = make_any_env(get_task("walker-walk", episode_length=8), seed=3)
+    action = env.action_spec.rand()
+    env.step(env.reset().set("action", action))
+    lead_back, rests = env.bookmark(), []
+    for _ in range(2):
+        rest = [env.step(TensorDict({"action": action}))["next"] for _ in range(3)]
+        rests.append([(row["observation"].tolist(), row["reward"].item(), row["truncated"].item()) for row in rest])
+        lead_back()
+    assert rests[0] == rests[1]
+    assert [truncated for _, _, truncated in rests[0]] == [False, False, True]
+
+
 @needs_gym
 def test_the_state_that_a_seeded_reset_began_with_is_kept():
     first, second = (make_any_env("gym/Pendulum-v1") for _ in range(2))

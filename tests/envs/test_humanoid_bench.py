@@ -42,6 +42,11 @@ def test_other_robots_goals_and_lengths():
         get_task("h1hand-wlak")
 
 
+@pytest.mark.parametrize("goal", ["kitchen", "cube", "push", "basketball", "insert-normal", "insert-small"])
+def test_an_episode_of_these_goals_has_500_steps(goal):
+    assert get_task(f"h1-{goal}").episode_length == 500
+
+
 @pytest.mark.skipif(INSTALLED, reason="needs an environment without the package")
 def test_a_missing_package_is_one_line_with_the_recipe():
     with pytest.raises(ImportError) as caught:

@@ -21,7 +21,7 @@ pytest.importorskip("dm_control")
 pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import Task, check_env, get_task, make_env, register_task  # noqa: E402
-from torchrl_etdmpc.envs.worker import SilentWithoutOwner, make_in_worker, signals_held_back  # noqa: E402
+from torchrl_etdmpc.envs.worker import SilentWithoutOwner, make_in_worker, signals_held_back, start_workers  # noqa: E402
 
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("imageio") is None, reason="needs gymnasium[mujoco]")
 
@@ -254,6 +254,22 @@ def test_a_process_that_ends_before_its_environment_is_made_is_one_line():
     register_task(task, fatal, replace=True)
     with pytest.raises(RuntimeError, match=r"^a process of task .fatal-pendulum. ended before its env"):
         make_env(task, num_envs=2)
+
+
+@pytest.mark.parametrize(("told", "seconds"), [(None, 300), ("50", 10_000)])
+def test_a_silent_process_counts_as_failed_after_five_minutes_unless_torchrl_is_told_a_time(told, seconds, monkeypatch):
+    class Workers:
+        BATCHED_PIPE_TIMEOUT = 10_000
+
+        def start(self) -> None:
+            pass
+
+    monkeypatch.delenv("BATCHED_PIPE_TIMEOUT", raising=False)
+    if told is not None:
+        monkeypatch.setenv("BATCHED_PIPE_TIMEOUT", told)
+    env = Workers()
+    start_workers(env)
+    assert env.BATCHED_PIPE_TIMEOUT == seconds
 
 
 def test_a_worker_s_seed_is_that_of_the_generators_that_simulators_share_too():

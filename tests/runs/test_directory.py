@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -309,6 +310,19 @@ def test_a_lock_that_its_owner_removed_in_the_last_moment_is_taken_again(tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 
+def test_a_lock_is_removed_before_it_is_let_go(begun, monkeypatch):
+    """Afterwards the file may be that of another process, which would lose it."""
+    close, there = os.close, []
+
+    def watched(descriptor: int) -> None:
+        there.append(begun.lock.exists())
+        close(descriptor)
+
+    monkeypatch.setattr(os, "close", watched)
+    begun.close()
+    assert there == [False]
+
+
 def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch):
     fcntl = pytest.importorskip("fcntl")
 
@@ -340,8 +354,9 @@ def leave_behind(directory: RunDirectory, **files: str) -> None:
         {},
         {"eval_csv": ROW.format(0), "train_csv": ""},
         {"checkpoints__resume__000000000000__manifest_json": "{}", "checkpoints__best_pt": "", "checkpoints__a_pt": ""},
+        {"tensorboard__events": "", "curve_png": ""},
     ],
-    ids=["configuration", "first evaluation", "first checkpoint"],
+    ids=["configuration", "first evaluation", "first checkpoint", "loggers and curve"],
 )
 def test_a_run_that_made_no_step_is_taken_over(tmp_path, files):
     directory = RunDirectory(tmp_path / "run")
@@ -351,6 +366,19 @@ def test_a_run_that_made_no_step_is_taken_over(tmp_path, files):
     assert directory.read_config()["seed"] == 2
     directory.close()
     assert {path.name for path in directory.path.iterdir()} == {"config.yaml", "notes.txt"}
+
+
+def test_a_process_that_is_killed_while_it_takes_a_run_over_leaves_one_that_is_taken_over(tmp_path, killed_at):
+    directory, files = RunDirectory(tmp_path / "run"), {"eval_csv": ROW.format(0), "checkpoints__best_pt": ""}
+    for moment in count(1):
+        leave_behind(directory, **files)
+        killed = killed_at(lambda: RunDirectory(directory.path).begin(CONFIG), moment)
+        assert directory.leftover or not directory.holds_a_run
+        directory.begin(CONFIG)
+        directory.close()
+        if not killed:
+            break
+    assert moment > 5
 
 
 def test_a_new_run_is_another_one_for_wandb_than_the_leftover_before_it(begun):

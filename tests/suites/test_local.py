@@ -89,6 +89,28 @@ def test_a_signal_stops_every_run_which_goes_on_later(small, tmp_path, stand_in,
     assert {read_progress(run).state for run in runs} == {"finished"}
 
 
+def test_a_run_whose_trial_ended_early_is_asked_to_stop_once(small, tmp_path, monkeypatch):
+    """Asked twice, it would leave without having saved itself."""
+
+    class Process:
+        returncode, told, looks = 75, 0, 0
+
+        def terminate(self):
+            self.told += 1
+
+        def poll(self):
+            self.looks += self.told > 0
+            return self.returncode if self.looks > 5 else None  # it takes its time to save itself
+
+    (run,) = small.experiment().runs(tmp_path)
+    queue, process = RunQueue([run]), Process()
+    monkeypatch.setattr(local, "start", lambda run, **places: process)
+    monkeypatch.setattr(queue, "to_be_stopped", lambda: queue._pruned.add(run.name) or {run.name})
+    assert run_locally(queue, workers=1)
+    assert process.told == 1
+    assert read_progress(run).state == "pruned"
+
+
 def test_nothing_is_left_running_if_the_suite_itself_fails(small, tmp_path, stand_in, monkeypatch):
     runs = small.experiment(seeds=(1, 2)).runs(tmp_path)
     stand_in({"seed1": [("wait", 100)], "seed2": [("finish", 400)]})
@@ -161,3 +183,18 @@ def test_runs_are_spread_over_the_gpus_and_the_cores_over_the_runs(small, tmp_pa
     assert {(threads, gpu) for variant, threads, gpu in given if variant == "any"} <= {(3, "3"), (3, "5")}
     assert {(threads, gpu) for variant, threads, gpu in given if variant == "cpu"} == {(3, None)}
     assert {gpu for _, _, gpu in given} >= {"3", "5"}
+
+
+def test_runs_that_are_fewer_than_the_gpus_have_room_for_are_on_different_ones(small, tmp_path, stand_in, monkeypatch):
+    monkeypatch.setattr(local, "visible_gpus", lambda: ["3", "5"])
+    given, start = [], local.start
+
+    def watched(run, **places):
+        given.append(places["gpu"])
+        return start(run, **places)
+
+    monkeypatch.setattr(local, "start", watched)
+    stand_in({})
+    runs = small.experiment(variants={"any": {"device": "auto"}}, seeds=(1, 2)).runs(tmp_path)
+    assert run_locally(RunQueue(runs), workers=2, per_gpu=2)
+    assert given == ["3", "5"]

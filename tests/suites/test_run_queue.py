@@ -52,6 +52,13 @@ def test_finished_and_pruned_runs_are_not_handed_out(queue_of, small, tmp_path):
     assert len(queue.runs) == 3
 
 
+def test_a_run_that_is_tried_again_comes_before_those_that_wait(queue_of):
+    queue = queue_of(seeds=(1, 2))
+    run = queue.next()
+    queue.ended(run, -signal.SIGKILL)
+    assert queue.next() == run
+
+
 def test_a_run_that_was_given_up_is_tried_again_by_the_next_suite(queue_of, small, tmp_path):
     (run,) = small.experiment().runs(tmp_path)
     note(run, "failed", "the simulator is gone")

@@ -124,6 +124,15 @@ def test_the_value_of_a_trial_is_the_mean_over_tasks_and_seeds_of_the_last_retur
     assert sweep.best().startswith("tuned: the best of 2 finished trials is trial ")
 
 
+def test_the_best_trial_is_the_one_of_the_highest_value_also_below_zero(search, small, tmp_path):
+    sweep = Sweep(search(trials=3), "tuned", tmp_path)
+    for returns in (-300.0, -100.0, -200.0):
+        (run,) = sweep.propose()
+        small.write_finished(run, returns=returns)
+        sweep.look()
+    assert sweep.best().startswith("tuned: the best of 3 finished trials is trial 1, -100.0: ")
+
+
 @pytest.mark.slow
 def test_the_search_finds_the_peak(search, small, tmp_path):
     sweep = Sweep(search(trials=40), "tuned", tmp_path)
@@ -226,6 +235,21 @@ def test_a_trial_below_the_median_of_five_ends_early(search, small, tmp_path):
     assert sweep.look() == bad
     assert study_of(tmp_path).trials[6].intermediate_values == dict.fromkeys((25, 50, 75, 100), 110.0)
     assert [run.name for run in sweep.runs()] == [run.name for run in good]
+
+
+def test_a_step_at_which_fewer_than_five_trials_were_evaluated_ends_none_early(search, small, tmp_path):
+    sweep = Sweep(search(trials=6), "tuned", tmp_path)
+    for number in range(5):
+        (run,) = sweep.propose()
+        small.write_finished(run)
+        if number:  # its evaluation at step 100 has failed
+            table = run.path / "eval.csv"
+            table.write_text(table.read_text().replace("\n100,50,0,2.5,500.0", "\n100,50,0,2.5,nan"))
+        assert sweep.look() == []
+    assert [100 in trial.intermediate_values for trial in study_of(tmp_path).trials] == [True, *[False] * 4]
+    (run,) = sweep.propose()
+    small.write_tables(run, 100, returns=1.0)
+    assert sweep.look() == []
 
 
 def test_trials_that_ended_unseen_count_in_the_median(search, small, tmp_path):

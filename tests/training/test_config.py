@@ -246,6 +246,22 @@ def test_the_cpu_preset_shrinks_sizes_and_keeps_the_whole_method():
     assert settings["replay.insertion"] == "step"
 
 
+def test_the_sizes_of_the_cpu_preset_are_those_that_its_results_were_measured_with():
+    settings = method_settings(preset("cpu"))
+    assert preset("cpu").total_env_steps == 50_000
+    assert {name: settings[f"model.{name}"] for name in ("latent_dim", "mlp_dim", "encoder_dim", "num_bins")} == {
+        **dict.fromkeys(("latent_dim", "mlp_dim", "encoder_dim"), 128),
+        "num_bins": 21,
+    }
+    assert (settings["model.num_dynamics"], settings["model.num_values"]) == (2, 2)
+    assert settings["model.activation"] == "silu"
+    budget = ("horizon", "num_samples", "num_elites", "num_proposals", "iterations")
+    assert [settings[f"planner.{name}"] for name in budget] == [3, 48, 6, 4, 3]
+    assert [settings[f"reanalyze.{name}"] for name in (*budget, "every")] == [3, 24, 3, 2, 3, 10]
+    assert (settings["optim.batch_size"], settings["optim.lr"], settings["loss.tau"]) == (64, 1e-3, 0.1)
+    assert (settings["replay.seed_decisions"], settings["replay.pretrain_updates"]) == (None, 1000)
+
+
 def test_the_small_tdmpc2_is_tdmpc2_with_the_sizes_of_cpu():
     small, full, cpu = (method_settings(preset(name)) for name in ("tdmpc2-cpu", "tdmpc2", "cpu"))
     changed = {name for name, value in small.items() if value != full[name]}

@@ -181,6 +181,28 @@ def test_a_row_says_how_many_updates_older_its_weights_were_than_the_learner_s(s
     learner.collector.shutdown()
 
 
+def test_weights_are_sent_as_soon_as_there_are_as_many_updates_as_are_said(started):
+    started()
+    learner = learner_of(config_of(send_every=16))
+    explore_and_pretrain(learner)
+    ages = []
+    for _ in range(4):
+        learner.collector.act()
+        rows = learner.collector.finish_step()
+        ages.append(rows["weight_age"].unique().tolist())
+        learner.updates(rows.numel())
+    assert ages == [[0], [8], [0], [8]]
+    learner.collector.shutdown()
+
+
+def test_no_worker_of_a_run_begins_as_one_of_a_run_with_another_seed_does():
+    starts = set()
+    for seed in (1, 2, 3):
+        parts = distributed.WorkerParts(config_of(seed=seed), (3, 1), discount=0.99)
+        starts |= {tuple(parts.make_env(number).reset()["observation"].tolist()) for number in range(3)}
+    assert len(starts) == 9
+
+
 def test_only_the_worker_that_sent_rows_gets_weights_where_each_has_its_own(started, monkeypatch):
     monkeypatch.setattr(distributed, "RayCluster", lambda address, *, workers: RayConnection())
     workers, learner = started(), learner_of(config_of(engine="ray"))

@@ -34,3 +34,10 @@ def test_sizes_beyond_the_memory_are_refused_by_name(settings, name):
         require_memory(TrainConfig.from_dict(settings), 24, 6, torch.device("cpu"))
     assert str(caught.value).startswith(f"{name} would take ")
     assert "\n" not in str(caught.value)
+
+
+def test_the_plans_of_all_episodes_of_an_evaluation_are_made_at_once(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.training.memory._memory_bytes", lambda device: 4 * 10**9)
+    require_memory(TrainConfig(), 24, 6, torch.device("cpu"))
+    with pytest.raises(ValueError, match=r"^planner\.\* would take "):
+        require_memory(TrainConfig(eval_episodes=1000), 24, 6, torch.device("cpu"))
