@@ -236,6 +236,31 @@ def test_methods_known_per_seed_on_all_tasks_have_an_interquartile_mean_on_the_p
     assert "Interquartile mean" not in write_report(comparison(short=True), tmp_path / "other").read_text("utf-8")
 
 
+def test_a_row_of_probabilities_is_how_often_its_method_scores_more_than_the_column_s(without_figures, tmp_path):
+    rows = [
+        (method, task, seed, step, height + seed)
+        for method, height in (("ours", 60.0), ("BMPC", 20.0))
+        for task in TASKS
+        for seed in (1, 2)
+        for step in STEPS
+    ]
+    curves = pd.DataFrame(rows, columns=["method", "task", "seed", "env_steps", "return_mean"])
+    none = pd.DataFrame(columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"])
+    found = compare(curves, none, benchmark=get_benchmark("dmc-easy"), tasks=TASKS)
+    page = write_report(found, tmp_path).read_text(encoding="utf-8")
+    assert "| method | interquartile mean | P(> ours) | P(> BMPC) | seeds per task |" in page
+    assert re.search(r"^\| ours \| [^|]+ \|  \| 1\.000 \(1\.000 to 1\.000\) \| 2 \|$", page, re.MULTILINE)
+    assert re.search(r"^\| BMPC \| [^|]+ \| 0\.000 \(0\.000 to 0\.000\) \|  \| 2 \|$", page, re.MULTILINE)
+
+
+def test_beside_a_mean_over_fewer_tasks_stands_the_first_method_s_over_the_same_ones(without_figures, tmp_path):
+    rows = [("paper", "walker-run", step, 70.0, "s") for step in (100_000, 200_000)]
+    quoted = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "source"])
+    page = write_report(comparison(short=True, points=quoted), tmp_path).read_text(encoding="utf-8")
+    assert "- On the one task of paper at 100,000: paper 70, ours 50.\n" in page
+    assert "task of paper at 200,000" not in page  # where ours was not evaluated
+
+
 def test_quoted_means_stand_in_the_aggregate_where_every_task_has_one(monkeypatch, tmp_path):
     rows = [("paper", task, 50_000, value, "s") for task, value in zip(TASKS, (20.0, 60.0), strict=True)]
     rows += [("paper", TASKS[0], 100_000, 90.0, "s")]

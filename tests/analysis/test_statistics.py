@@ -272,6 +272,13 @@ def test_the_normaliser_is_read_between_evaluations_and_missing_where_the_curve_
     assert constants.to_dict() == {"x": 4.0}
 
 
+def test_nothing_is_divided_by_a_return_of_zero():
+    table = pd.concat(
+        [curve([0, 1e5], [5.0, last], method="BMPC", task=task) for task, last in (("x", 0.0), ("y", 2.0))]
+    )
+    assert normalisers(table, 100_000).to_dict() == {"y": 2.0}
+
+
 def test_another_method_can_normalise():
     assert normalisers(pd.concat([curve([0], 2.0), curve([0], 3.0, method="BMPC")]), 0, "a").to_dict() == {"x": 2.0}
 

@@ -59,6 +59,22 @@ def test_a_trace_holds_the_planner_s_own_numbers(make):
     assert trace.manifest["task"] == "line"
 
 
+@pytest.mark.parametrize("make", [cem, mppi])
+def test_what_acts_is_the_last_mean_and_its_value_and_deviation_are_of_the_weighted_elites(make):
+    torch.manual_seed(0)
+    trace = trace_torchrl_planner(make(), STATE)
+    assert np.array_equal(trace["chosen_actions"], trace["mean"][-1])
+    ranked = np.take_along_axis(trace["scores"], trace["elites"], 1)
+    weights = np.exp(ranked - ranked.max(1, keepdims=True)) if make is mppi else np.ones_like(ranked)
+    weights /= weights.sum(1, keepdims=True)
+    np.testing.assert_allclose(trace["elite_weights"], weights, atol=1e-5)
+    assert trace["value"] == pytest.approx((weights[-1] * ranked[-1]).sum(), rel=1e-4)
+    best = np.take_along_axis(trace["actions"], trace["elites"][..., None, None], 1)
+    variance = (weights[..., None, None] * np.square(best - trace["mean"][:, None])).sum(1)
+    bessel = 5 / 4 if make is cem else 1.0
+    np.testing.assert_allclose(trace["std"], np.sqrt(variance * bessel), atol=1e-5)
+
+
 def test_where_mppi_s_weights_overflow_the_trace_has_its_nan():
     planner = mppi()
     planner.temperature = torch.tensor(1e4)

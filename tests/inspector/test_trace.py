@@ -66,6 +66,23 @@ def test_the_chosen_sequence_begins_with_the_planner_s_action(choice, explore):
         assert np.array_equal(trace["returns"][-1, chosen], trace["chosen_returns"])
 
 
+@pytest.mark.parametrize("explore", [False, True])
+def test_training_may_choose_otherwise_than_evaluation(explore):
+    planner = make(first_action="mean", eval_first_action="best")
+    trace = trace_plan(planner, OBSERVATION, explore=explore, seed=2)
+    assert np.array_equal(trace["chosen_actions"][0], plan_of(planner, 2, explore=explore).loc[0].numpy())
+    assert (int(trace["chosen"]) == -1) == explore
+
+
+def test_of_the_elites_the_one_that_was_drawn_is_chosen():
+    planner, places = make(eval_first_action="elite", inverse_temperature=0.0), set()
+    for seed in range(4):
+        trace = trace_plan(planner, OBSERVATION, seed=seed)
+        assert np.array_equal(trace["chosen_actions"][0], plan_of(planner, seed, explore=False).loc[0].numpy())
+        places.add(trace["elites"][-1].tolist().index(int(trace["chosen"])))
+    assert len(places) > 1
+
+
 def test_what_does_not_come_from_the_search_is_what_the_planner_would_say():
     planner = make()
     trace = trace_plan(planner, OBSERVATION)

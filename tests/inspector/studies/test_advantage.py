@@ -58,3 +58,10 @@ def test_the_median_of_an_even_number_lies_in_the_middle():
     result = advantage.Advantage(earned, torch.zeros(4), torch.zeros(4, 2), 1, 2, torch.arange(4))
     (row,) = advantage.table(result)
     assert row["median"] == 2.0
+
+
+def test_the_interval_of_a_difference_is_over_episodes():
+    episode = torch.arange(40) // 20
+    result = advantage.Advantage(episode.float(), torch.zeros(40), torch.zeros(40, 2), 1, 2, episode)
+    (row,) = advantage.table(result)
+    assert (row["low"], row["difference"], row["high"]) == (0.0, 0.5, 1.0)

@@ -50,6 +50,23 @@ def test_heads_that_err_alike_do_not_know_it(measure):
     assert result.disagreement[..., 0].abs().max() < 1e-6
 
 
+def test_random_actions_go_both_ways(make_episodes, make_planner, WorldSimulator):
+    rolled = []
+
+    class Watched(WorldSimulator):
+        def roll(self, actions):
+            rolled.append(actions)
+            return super().roll(actions)
+
+    world = Unsure(num_dynamics=2, policy_gain=1.0)
+    states = choose_states(make_episodes(world, torch.zeros_like), 20, ahead=2)
+    planner = make_planner(world, num_samples=16, num_elites=4, iterations=1)
+    calibration.calibration(planner, states, Watched(world), horizon=2)
+    random = torch.stack(rolled[20:])
+    assert -1 <= random.min() < -0.5
+    assert 0.5 < random.max() <= 1
+
+
 def test_rank_correlation_is_spearman_s():
     torch.manual_seed(0)
     pairs = torch.randn(50, 3, 2)
@@ -93,3 +110,12 @@ def test_pairs_that_are_not_there_change_no_rank():
     pairs[::3, 1] = torch.nan
     expected = spearmanr(*pairs[~pairs[:, 1].isnan()].T).statistic
     assert calibration.rank_correlation(pairs).item() == pytest.approx(expected)
+
+
+def test_a_ratio_is_that_of_the_means_and_intervals_are_over_episodes():
+    disagreement = torch.tensor([1.0, 3.0]).repeat(20).view(40, 1, 1).expand(-1, 2, 1)
+    error = torch.tensor([[1.0, 9.0], [18.0, 2.0]]).repeat_interleave(10, 0).view(40, 1, 1).expand(-1, 2, 1)
+    for row in calibration.table(calibration.Calibration(disagreement, error, torch.arange(40) // 20)):
+        ratio = [row[name] for name in ("ratio_low", "error_over_disagreement", "ratio_high")]
+        assert ratio == pytest.approx([2.5, 3.75, 5])
+        assert [row["low"], row["high"]] == pytest.approx([-1, 1])

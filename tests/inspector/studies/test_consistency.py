@@ -55,6 +55,23 @@ def test_every_change_is_measured_by_the_last_deviation_of_the_plan_from_the_war
         assert torch.allclose(result.change[:, row, :-1], (plan.mean / std).abs()[:, :-1, 0])
 
 
+def test_the_plan_before_is_compared_a_step_further_on_and_other_samples_are_other_ones(
+    world, make_episodes, make_planner
+):
+    planner, before = make_planner(world), torch.tensor([[0.5], [-0.25], [0.1]])
+    episodes = [
+        episode._replace(plan_mean=before.expand(len(episode.reward), -1, -1))
+        for episode in make_episodes(world, world.optimal_action)
+    ]
+    states = choose_states(episodes, 9)
+    result, kept = consistency.consistency(planner, states, seed=3), states.step > 0
+    observation, carried = states.observation[kept], states.plan_mean[kept]
+    warm = replan(planner, observation, carried, generator=generator_of(planner, 3), trace=True)
+    moved = (warm.mean[:, :-1] - before[1:]) / warm.trace.std[:, -1, :-1]
+    assert torch.allclose(result.change[:, 0, :-1], moved.abs()[..., 0])
+    assert (result.change[:, 2] > 0).all()
+
+
 def test_first_decisions_are_left_out_and_states_without_plans_refused(world, make_episodes, make_planner):
     planner, episodes = make_planner(world), make_episodes(world, world.optimal_action, steps=4)
     states = choose_states(episodes, 100)
@@ -71,3 +88,10 @@ def test_a_planner_that_reads_no_plan_before_is_refused(world, make_episodes, ma
     states = choose_states(make_episodes(world, world.optimal_action, steps=4), 100)
     with pytest.raises(ValueError, match="reads no plan before"):
         consistency.consistency(make_planner(world, initial="policy"), states)
+
+
+def test_the_interval_of_a_change_is_over_episodes():
+    episode = torch.arange(40) // 20
+    change = episode.view(40, 1, 1).expand(-1, 3, 2).float()
+    rows = consistency.table(consistency.Consistency(change, torch.ones(40, 2), episode))
+    assert {(row["low"], row["change_in_std"], row["high"]) for row in rows} == {(0.0, 0.5, 1.0)}

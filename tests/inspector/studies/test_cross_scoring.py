@@ -40,6 +40,14 @@ def test_all_estimates_agree_where_all_heads_are_exact(make_episodes, make_plann
     assert (result.gain[:, :, 2] > 0).all()  # half of the best action is not the best
 
 
+def test_a_planner_that_is_pessimistic_is_compared_without(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=2, num_values=2, value_offset=[0.2, -0.2], policy_gain=0.5)
+    states = choose_states(make_episodes(world, world.optimal_action), 4, ahead=3)
+    planners = make_planner(world), make_planner(world, score="adaptive", beta=3.0)
+    one, other = (cross_scoring.cross_scoring(it, states, WorldSimulator(world), **BUDGET) for it in planners)
+    assert torch.equal(one.returns, other.returns)
+
+
 def test_an_agent_of_one_head_has_no_ensemble_to_compare_with(make_episodes, make_planner, WorldSimulator):
     world = LineWorld(num_dynamics=1, num_values=1)
     states = choose_states(make_episodes(world, world.optimal_action), 2, ahead=3)
@@ -72,3 +80,10 @@ def test_the_median_of_an_even_number_lies_in_the_middle():
     returns[:, :2] = torch.tensor([0.0, 1.0, 3.0, 100.0]).view(4, 1, 1)
     rows = cross_scoring.table(cross_scoring.CrossScores(returns, 1.0, torch.arange(4)))
     assert {row["median"] for row in rows} == {2.0}
+
+
+def test_the_interval_of_a_gain_is_over_episodes():
+    returns = torch.zeros(40, 3, 3)
+    returns[:20, :2] = 1.0
+    rows = cross_scoring.table(cross_scoring.CrossScores(returns, 1.0, torch.arange(40) // 20))
+    assert {(row["low"], row["gain"], row["high"]) for row in rows} == {(0.0, 0.5, 1.0)}

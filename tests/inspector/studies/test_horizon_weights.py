@@ -4,14 +4,16 @@ import pytest
 import torch
 
 from torchrl_etdmpc.functional import adaptive_mixture
+from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies import choose_states, horizon_weights
+from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.testing import LineWorld
 
 DISCOUNT, APART = 0.5, 0.2
 
 
 def test_the_weights_are_the_inverse_variances_where_all_depths_promise_the_same(make_episodes, make_planner):
-    # At the goal every return is 0 and the values are APART beside it: sigma of depth h is APART / sqrt(2) * 0.5^h.
+    # At the goal every return is 0 and the values are APART beside it: sigma of depth h is APART * 0.5^h.
     world = LineWorld(goal=0.0, num_values=2, value_offset=[APART, -APART], policy_gain=1.0)
     episodes = make_episodes(world, torch.zeros_like)
     states = choose_states(episodes, 4)
@@ -35,6 +37,26 @@ def test_without_pessimism_the_best_depth_has_all_the_weight(make_episodes, make
     assert torch.equal(result.weights.amax(-1), torch.ones(4, 1, 6))
     _, weights = adaptive_mixture(result.mean, result.sigma, 0.0)
     assert torch.equal(result.weights[:, :, -1], weights)
+
+
+def test_every_beta_is_planned_with_the_same_random_numbers(make_episodes, make_planner):
+    world = LineWorld(goal=1.0, num_values=2, value_offset=[APART, -APART], policy_gain=1.0)
+    states = choose_states(make_episodes(world, torch.zeros_like), 4)
+    result = horizon_weights.horizon_weights(make_planner(world), states, betas=(1.0, 1.0), horizon=3, seed=2)
+    for field in (result.weights, result.mean, result.sigma):
+        assert torch.equal(*field.unbind(1))
+
+
+def test_estimates_are_of_the_last_elites_of_a_plan_with_this_beta(make_episodes, make_planner):
+    world = LineWorld(goal=1.0, num_dynamics=2, drift=[[0.3], [-0.3]])  # heads agree at the goal alone
+    states = choose_states(make_episodes(world, torch.zeros_like), 4)
+    planner = make_planner(world, discount=DISCOUNT, num_samples=32, num_elites=1, num_proposals=0)
+    result = horizon_weights.horizon_weights(planner, states, betas=(10.0,), horizon=3, seed=2)
+    searcher = with_settings(planner, score="adaptive", beta=10.0)
+    scores = replan(searcher, states.observation, generator=generator_of(planner, 2), trace=True).trace.scores
+    assert (scores[:, -1].amax(-1) > scores[:, 0].amax(-1)).any()
+    value, _ = adaptive_mixture(result.mean[:, 0], result.sigma[:, 0], 10.0)
+    assert torch.allclose(value, scores[:, -1].amax(-1))
 
 
 def test_candidates_without_a_finite_score_have_no_weights(make_episodes, make_planner):
@@ -79,3 +101,11 @@ def test_a_candidate_that_diverged_is_no_elite(make_episodes, make_planner, bad)
     states = choose_states(make_episodes(world, torch.zeros_like), 4)
     result = horizon_weights.horizon_weights(make_planner(world), states, betas=(1.0,), horizon=3)
     assert all(field.isfinite().all() for field in (result.weights, result.mean, result.sigma))
+
+
+def test_the_interval_of_a_weight_is_over_episodes():
+    episode = torch.arange(40) // 20
+    weights = torch.stack([episode, 1 - episode], dim=-1).view(40, 1, 1, 2).float()
+    result = horizon_weights.HorizonWeights(weights, torch.ones(40, 1, 2), torch.ones(40, 1, 2), (1.0,), episode)
+    rows = horizon_weights.table(result)
+    assert {(row["low"], row["weight"], row["high"]) for row in rows} == {(0.0, 0.5, 1.0)}

@@ -74,6 +74,14 @@ def test_components_are_those_of_the_largest_spread():
     assert shares[0] > shares[1]
 
 
+def test_a_plan_begins_from_its_warm_start(make_planner):
+    planner = make_planner(LineWorld(policy_gain=1.0), iterations=1)
+    observation, carried = torch.zeros(70, 1), torch.linspace(-0.9, 0.9, 70).reshape(70, 1, 1).expand(-1, 3, -1)
+    plan = replan(planner, observation, carried, generator=generator_of(planner, 0), trace=True)
+    searched = plan.trace.actions[:, 0, 4:].mean((1, 2, 3))  # without the policy's sequences
+    assert torch.corrcoef(torch.stack([searched, carried[:, 0, 0]]))[0, 1] > 0.9
+
+
 def test_a_planner_without_a_warm_start_is_given_none(make_planner):
     planner = make_planner(LineWorld(policy_gain=1.0), warm_start=False)
     observation, carried = torch.zeros(2, 1), torch.full((2, 3, 1), 0.9)

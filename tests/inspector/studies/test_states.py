@@ -59,6 +59,13 @@ def test_an_interval_knows_that_states_of_one_episode_are_no_independent_evidenc
     assert 0 <= together.low < 1.5 < together.high <= 3
 
 
+def test_the_interval_is_that_of_95_percent_of_the_resamples():
+    values = torch.randn(60, generator=torch.Generator().manual_seed(0))
+    interval = episode_interval(values, torch.arange(60), resamples=4000)
+    error = values.std(correction=0) / 60**0.5
+    assert ((interval.high - interval.low) / (2 * error)).item() == pytest.approx(1.96, rel=0.06)
+
+
 def test_one_episode_has_no_interval():
     interval = episode_interval(torch.arange(3.0), torch.zeros(3))
     assert interval.value.item() == 1
@@ -86,6 +93,14 @@ def test_nothing_is_earned_or_observed_after_the_end(make_episodes, WorldSimulat
     whole, _, lives = roll_all(WorldSimulator(world), states, torch.ones(3, 4, 1))
     assert lives.all()
     assert torch.allclose(whole[:, -1] - whole[:, 0], torch.tensor(2.0))
+
+
+def test_the_state_in_which_the_task_ends_is_worth_nothing(make_planner, make_episodes, EndingSimulator):
+    world = LineWorld(value_offset=torch.tensor([100.0]))
+    states = choose_states(make_episodes(world, torch.zeros_like), 3, ahead=4)
+    returns = true_returns(make_planner(world), *roll_all(EndingSimulator(world), states, torch.ones(3, 4, 1)))
+    assert (returns[:, 0] > 50).all()
+    assert (returns[:, 1:] < 50).all()
 
 
 def test_what_follows_a_time_limit_is_unknown(make_planner, make_episodes, WorldSimulator):

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from torchrl_etdmpc.inspector.studies import choose_states, value_bias
+from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.testing import LQRWorld
 
 DISCOUNT, OFFSET = 0.9, 2.0
@@ -19,6 +20,19 @@ def test_an_offset_of_the_values_is_found_less_the_share_that_is_the_prediction_
     assert torch.allclose(result.bias[:, 0], OFFSET * (1 - share), atol=1e-4)
     # The plan is worth as much, and its value stands three steps further on.
     assert torch.allclose(result.bias[:, 1], OFFSET * (DISCOUNT**3 - share), atol=0.02)
+
+
+def test_the_plan_is_made_from_the_warm_start_of_its_decision(make_episodes, make_planner):
+    world = LQRWorld(discount=DISCOUNT)
+    planner = make_planner(world, discount=DISCOUNT, iterations=1)
+    episodes = [
+        episode._replace(plan_mean=torch.full_like(episode.plan_mean, 0.8))
+        for episode in make_episodes(world, world.optimal_action)
+    ]
+    states = choose_states(episodes, 12)
+    result = value_bias.value_bias(planner, episodes, states, seed=2)
+    plan = replan(planner, states.observation, states.plan_mean, generator=generator_of(planner, 2))
+    assert torch.equal(result.predicted[:, 1], plan.value)
 
 
 def test_after_an_end_nothing_is_promised(make_episodes, make_planner):
@@ -45,3 +59,10 @@ def test_the_lines_say_bias_and_scale():
     assert value_bias.lines(result)[0] == (
         "value: +1.00 [+1.00, +1.00] against the return that followed (5.5 +- 3.6), correlation 1.00"
     )
+
+
+def test_the_interval_of_a_bias_is_over_episodes():
+    episode = torch.arange(40) // 20
+    predicted = episode.unsqueeze(-1).expand(-1, 2).float()
+    result = value_bias.ValueBias(predicted, torch.zeros(40), torch.zeros(40), episode, torch.arange(40) % 20)
+    assert {(row["low"], row["bias"], row["high"]) for row in value_bias.table(result)} == {(0.0, 0.5, 1.0)}

@@ -28,7 +28,7 @@ _MOST_LINES = 6  # action dimensions that are drawn as lines; more are an image
 
 @figure_of
 def score_spread(trace: Trace) -> Drawing:
-    """Best, median and worst elite score and the median candidate's after every iteration, and the policy's own."""
+    """Best and worst elite score and the median candidate's after every iteration, and the policy's own."""
     scores = np.where(np.isfinite(trace["scores"]), trace["scores"], -np.inf)
     elites = np.take_along_axis(scores, trace["elites"], 1)
     steps = np.arange(1, trace.iterations + 1)
