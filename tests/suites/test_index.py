@@ -146,6 +146,21 @@ def test_long_tables_are_read_from_their_end(runs, small):
     assert read_progress(runs[0]).decisions_per_second == pytest.approx(4.0)
 
 
+def test_a_run_that_ends_while_it_is_read_is_finished_with_its_last_return_or_not_yet(runs, small, monkeypatch):
+    last_rows = index.last_rows
+
+    def ends_meanwhile(table):
+        rows = last_rows(table)
+        small.write_finished(runs[0])
+        return rows
+
+    small.write_tables(runs[0], 100, returns=5.0)
+    monkeypatch.setattr(index, "last_rows", ends_meanwhile)
+    assert read_progress(runs[0]).state == "stopped"
+    progress = read_progress(runs[0])
+    assert (progress.state, progress.latest_return) == ("finished", 500.0)
+
+
 def test_a_column_may_have_a_name_of_any_letters(runs, small):
     small.write_tables(runs[0], 200)
     rows = "".join(f"{i},{i},0,{i / 4},0\n" for i in range(5))

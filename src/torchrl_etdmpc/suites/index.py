@@ -56,18 +56,20 @@ def read_progress(run: Run) -> Progress:
     'waiting'
     """
     directory = RunDirectory(run.path)
+    # In the reverse of the order in which a run ends (tables, summary, lock), so that one that ends meanwhile is whole.
+    in_use, finished = directory.in_use, directory.finished
     evals, rows = last_rows(directory.eval), last_rows(directory.train)
     latest = number_of(evals[-1], "return_mean") if evals else math.nan
     steps = max((whole_of(row, "env_steps") for row in (*evals[-1:], *rows[-1:])), default=0)
     speed = _speed(rows)
-    if directory.finished:
+    if finished:
         summary = _summary(directory.summary)
         steps = whole_of(summary, "env_steps") or steps
         if steps >= run.config.total_env_steps:
             if "final_return" in summary:  # null: the last evaluation failed, and an earlier one is not it
                 latest = number_of(summary, "final_return")
             return Progress("finished", steps, latest, number_of(summary, "decisions_per_second", speed))
-    if directory.in_use:
+    if in_use:
         return Progress("running", steps, latest, speed)
     verdict = last_verdict(run)
     if verdict is not None:
