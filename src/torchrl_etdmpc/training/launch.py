@@ -77,7 +77,7 @@ def plan_launch(config: TrainConfig, explicit: Iterable[str] = ()) -> Launch:
         FileExistsError: if the directory holds a run and ``resume`` is off.
         FileNotFoundError: if there is no run to go on with and ``resume`` is on, or a run with results has no
             checkpoint to go on from.
-        ValueError: if the command names a setting with another value than the run's, and it may not change.
+        ValueError: as :func:`resumed_config` does, or if the run has made as many env steps as are asked for.
 
     >>> import tempfile
     >>> from torchrl_etdmpc.training import preset
@@ -305,8 +305,8 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
             from the run.
 
     Raises:
-        ValueError: if the command names a setting with another value than the run's, and it may not change, or what is
-            no setting.
+        ValueError: if the command names what is no setting, or a setting with another value than the run's, and it may
+            not change.
 
     >>> from torchrl_etdmpc.training import preset
     >>> resumed_config(preset("cpu"), {"total_env_steps": 100_000}, ["total_env_steps"]).total_env_steps
