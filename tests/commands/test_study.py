@@ -21,7 +21,7 @@ from torchrl_etdmpc import commands  # noqa: E402
 from torchrl_etdmpc.commands import study as study_command  # noqa: E402
 from torchrl_etdmpc.commands.study import StudyName  # noqa: E402
 from torchrl_etdmpc.inspector import Simulator, play_episode  # noqa: E402
-from torchrl_etdmpc.inspector.studies import advantage, choose_states  # noqa: E402
+from torchrl_etdmpc.inspector.studies import advantage, choose_states, consistency  # noqa: E402
 from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, save_agent  # noqa: E402
 
 NAMES = [name for name in get_args(StudyName) if name != "all"]
@@ -144,8 +144,7 @@ def test_all_makes_every_study(tmp_path, checkpoint, study):
 
 
 def test_every_study_has_a_function_of_its_name_and_the_three_others():
-    import importlib
-
+    
     for name in NAMES:
         module = importlib.import_module(f"torchrl_etdmpc.inspector.studies.{name}")
         assert all(callable(getattr(module, part)) for part in (name, "table", "lines", "figure"))
@@ -197,6 +196,34 @@ def test_episodes_that_are_too_short_are_refused(checkpoint, study):
     )
 
 
+def test_no_state_looks_beyond_the_time_limit(tmp_path, study):
+    pytest.importorskip("gymnasium")
+    checkpoint = untrained(tmp_path, num_dynamics=2, task="gym/InvertedPendulum-v5", observation_dim=4)
+    arguments = (f"checkpoint={checkpoint}", "task.episode_length=3", *FEW, "out=st")
+    message, _, _ = study("cross_scoring", *arguments)  # it falls at the third decision, which is the last
+    assert message is None
+    assert np.load(Path("st", "cross_scoring.npz"))["episode"].tolist() == [0, 1]  # three steps ahead of the starts
+
+
+def test_plans_have_the_command_s_seed(checkpoint, study):
+    message, _, _ = study("consistency", f"checkpoint={checkpoint}", *FEW, "out=st")
+    assert message is None
+    agent, config, _ = load_agent(checkpoint)
+    episodes = [play_episode(agent.eval_planner, config.task_spec, seed=seed) for seed in (4, 5)]
+    states = choose_states(episodes, 6, ahead=1, seed=4)
+    change = np.load(Path("st", "consistency.npz"))["change"]
+    same, other = (consistency.consistency(agent.eval_planner, states, seed=seed).change for seed in (4, 0))
+    np.testing.assert_array_equal(change, same)
+    assert not np.allclose(change, other)
+
+
+def test_values_are_asked_for_in_the_first_half_of_an_episode(checkpoint, study):
+    message, _, _ = study("value_bias", f"checkpoint={checkpoint}", "episodes=2", "states=40", "device=cpu", "out=st")
+    assert message is None
+    steps = np.load(Path("st", "value_bias.npz"))["step"]
+    assert sorted({*steps.tolist()}) == list(range(16))  # of 30, so that 15 follow
+
+
 def test_episodes_that_end_early_count_as_long_as_they_were(tmp_path, study):
     pytest.importorskip("gymnasium")
     checkpoint = untrained(tmp_path, num_dynamics=2, task="gym/InvertedPendulum-v5", observation_dim=4)
@@ -206,6 +233,8 @@ def test_episodes_that_end_early_count_as_long_as_they_were(tmp_path, study):
     assert about["mean_return"] < 100  # of 1,000 decisions, each of which is worth 1
     true = [row for row in rows(Path("st", "cross_scoring.csv")) if row["scored_by"] == "simulator"]
     assert all(abs(float(row["gain"])) < 100 for row in true)
+    played = about["mean_return"] + 1  # the decision that ends it pays nothing
+    assert np.load(Path("st", "cross_scoring.npz"))["scale"] == pytest.approx(round(played) / 3)
     assert "value_bias: left out" not in out
     assert "advantage: left out" not in out
 

@@ -180,7 +180,9 @@ def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_inter
     assert not list(Path().glob(".report*"))
 
 
-@pytest.mark.parametrize("name", ["a/walker-walk/seed1/config.yaml", "a/walker-walk/seed1/eval.csv", "experiment.yaml"])
+@pytest.mark.parametrize(
+    "name", [*(f"a/walker-walk/seed1/{file}" for file in ("config.yaml", "eval.csv", "summary.json")), "experiment.yaml"]
+)
 def test_watching_notices_what_a_report_reads(name):
     root = make_experiment()
     arguments = argparse.Namespace(runs=[str(root)])
@@ -460,6 +462,14 @@ def test_a_budget_that_the_usual_step_does_not_divide_has_another_one(run_main):
     assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 2_500
 
 
+def test_the_grid_begins_where_all_methods_do_and_its_step_is_no_shorter(run_main):
+    for name, first in (("early", 0), ("late", 20_000)):
+        rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(first, 100_001, 20_000))
+        make_run(f"runs/{name}", text=HEADER + "".join(rows))
+    run_main("early=runs/early", "late=runs/late")
+    assert "grid of the AUC: 20,000 to 100,000 every 20,000 env steps" in Path("report", "index.md").read_text()
+
+
 def test_a_small_budget_needs_no_step_of_the_grid(run_main, capfd):
     rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 25_001, 5_000))
     make_run("runs/a", text=HEADER + "".join(rows))
@@ -603,6 +613,9 @@ def test_variants_of_an_experiment_are_compared_in_pairs_at_its_budget(run_main,
     run_main("runs/exp")
     assert [row["base"] for row in read_rows("paired.csv")] == ["b"] * 3
     assert Path("report", "auc.md").read_text().startswith("| task | b | a |")  # in the order of the plan
+    plan.write_text(json.dumps({**json.loads(plan.read_text()), "base": "b", "variants": {"a": {}, "b": {}}}))
+    run_main("runs/exp")
+    assert [row["base"] for row in read_rows("paired.csv")] == ["b"] * 3  # whatever the order
     run_main("runs/exp", "--paired", "a")
     assert [row["base"] for row in read_rows("paired.csv")] == ["a"] * 3
     run_main("runs/exp", "--paired", "b")
@@ -649,6 +662,15 @@ def test_missing_and_unfinished_runs_are_named_on_the_page_and_in_the_line_and_s
     assert "## Missing and unfinished runs\n\n" + "".join(f"- {line}\n" for line in named) in page
     assert float(read_table(Path("report", "final.csv"))["walker-walk"]["a"]) == 52  # of the seed that is there
     assert [(row["pairs"], row["left_out"]) for row in read_rows("paired.csv")] == [("1", "1"), ("1", "2"), ("2", "3")]
+
+
+def test_a_plan_that_no_run_has_reached_yet_is_compared_where_all_are(run_main, capfd):
+    root = make_experiment()
+    plan = root / "experiment.yaml"
+    plan.write_text(json.dumps({**json.loads(plan.read_text()), "budget": 100_000}))
+    run_main("runs/exp")
+    assert "compared at 50,000, which all of them reach" in capfd.readouterr().out
+    assert float(read_table(Path("report", "final.csv"))["walker-walk"]["a"]) == 51.5
 
 
 def test_a_part_of_an_experiment_misses_nothing_of_the_rest_and_a_bad_plan_is_one_line(run_main, capfd):
