@@ -1,6 +1,6 @@
 """Learning runs of the cpu preset: the experiment `cpu-all`, what is kept of its runs, and reports.
 
-    python benchmarks/cpu_learning.py                 # 28 tasks, 3 seeds, 100,000 env steps: 23 hours on two cores
+    python benchmarks/cpu_learning.py                 # 28 tasks, 3 seeds, 100,000 env steps: 32 hours on two cores
     python benchmarks/cpu_learning.py --tasks walker-stand --seeds 1
     python benchmarks/cpu_learning.py --report-only   # from the committed files
 
