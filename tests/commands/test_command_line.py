@@ -51,6 +51,8 @@ WRONG = [
     (("hydra.run.dir=x",), "unknown setting hydra.run.dir; --help lists all."),
     (("planner=3",), "planner is a group of settings; --help planner lists them, e.g. planner.horizon=..."),
     (("planner.horizon=[1",), "planner.horizon must be a whole number, got '[1'."),
+    (("planner.horizon=３",), "planner.horizon must be a whole number, got '３'."),
+    (("task.episode_length=inf",), "task.episode_length must be a whole number, got 'inf'."),
     (("planner.horizon=",), "planner.horizon must not be empty."),
     (("optim.lr=1,2",), "optim.lr must be a number, got '1,2'."),
     (("eval_policy={}",), "eval_policy must be true or false, got '{}'."),

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_etdmpc.commands import evaluate, export, train
-from torchrl_etdmpc.training import TrainConfig, load_agent
+from torchrl_etdmpc.commands import evaluate, export, inspect_planner, study, train
+from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, save_agent
 
 pytest.importorskip("hydra")
 pytest.importorskip("gymnasium")
@@ -35,6 +35,10 @@ TINY = [
     *("replay.pretrain_updates=2", "model.latent_dim=8", "model.mlp_dim=8", "model.encoder_dim=8", "run_dir=run"),
     *("planner.horizon=2", "planner.num_samples=6", "planner.num_elites=3", "planner.iterations=1"),
 ]
+SMALL = {
+    "model": {"latent_dim": 8, "mlp_dim": 8, "encoder_dim": 8},
+    "planner": {"horizon": 2, "num_samples": 6, "num_elites": 3, "num_proposals": 1, "iterations": 1},
+}
 OWN = ["planner.score=my_ideas:cautious", "loss.extra_terms=my_ideas:terms"]
 
 
@@ -80,6 +84,36 @@ def test_a_score_and_terms_are_reached_from_the_command_line_and_from_there_alon
         assert command is not train or "my_ideas" not in sys.modules
     with pytest.raises(SystemExit, match=r"loss\.extra_terms 'my_ideas:terms' names code, which must be given on the"):
         call(evaluate, agent, repeated[0])
+
+
+TRAINED = "must be what the agent was trained with"
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "message"),
+    [
+        (
+            evaluate,
+            "score=my_ideas:cautious",
+            f"score {TRAINED}, mean, got my_ideas:cautious; leave it out, or plan with another score: "
+            "planner.score=my_ideas:cautious.",
+        ),
+        (study, "study=all reanalyze_score=my_ideas:cautious", f"reanalyze_score {TRAINED}, final, got my_ideas:caut"),
+        (export, "extra_terms=my_ideas:terms", f"extra_terms {TRAINED}, null, got my_ideas:terms; leave it out."),
+        (inspect_planner, "extra_terms=my_ideas:terms", f"extra_terms {TRAINED}, null, got my_ideas:terms; leave it"),
+        (evaluate, "score=final", "score 'final' must read package.module:attribute."),
+        (export, "task.episode_length=20", "task.episode_length changes nothing of a policy or a planner; leave it"),
+        (export, "task=gym/Acrobot-v1", "task must be that of the checkpoint, 'gym/Pendulum-v1', got 'gym/Acrobot-v1'"),
+    ],
+)
+def test_what_would_change_nothing_is_refused(call, tmp_path, command, typed, message):
+    config = TrainConfig.from_dict({"task": "gym/Pendulum-v1", "compile": "off", **SMALL})
+    save_agent(tmp_path / "last.pt", build_agent(config, 3, 1), config, {"env_steps": 0})
+    before = {*tmp_path.iterdir()}
+    with pytest.raises(SystemExit) as caught:
+        call(command, "checkpoint=last.pt", *typed.split())
+    assert str(caught.value).startswith(f"error: {message}")
+    assert {path for path in tmp_path.iterdir() if path.name != "__pycache__"} == before
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,11 @@ _MENDED = {
         "height is a single number (append UnsqueezeTransform(-1, in_keys=['height'])); "
         "observation is missing (append CatTensors(in_keys=['height', 'position'], out_key='observation'))",
     ),
+    "vectors of two precisions": (
+        {"observations": {"position": Unbounded(2), "velocity": Unbounded(3, dtype=torch.float64)}},
+        "velocity is float64 instead of float32 (append DoubleToFloat(in_keys=['velocity'])); "
+        "observation is missing (append CatTensors(in_keys=['position', 'velocity'], out_key='observation'))",
+    ),
     "float64 observation": (
         {"observations": {"observation": Unbounded(3, dtype=torch.float64)}},
         "observation is float64 instead of float32 (append DoubleToFloat(in_keys=['observation']))",
@@ -110,6 +115,10 @@ _MENDED = {
     "float64 action": (
         {"action": Bounded(-1, 1, shape=(2,), dtype=torch.float64)},
         "action is float64 instead of float32 (append DoubleToFloat(in_keys_inv=['action']))",
+    ),
+    "a matrix of actions": (
+        {"action": Bounded(-1, 1, shape=(2, 3), dtype=torch.float32)},
+        "action has the shape [2, 3] instead of [A] (append FlattenAction(-2, -1, in_keys_inv=['action']))",
     ),
     "another action's name": (
         {"action_key": "torque"},

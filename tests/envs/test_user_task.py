@@ -84,7 +84,6 @@ def unscaled(): return GymEnv("Pendulum-v1")
 def not_wrapped(): return PendulumEnv()
 def number(): return 3
 def two(): return SerialEnv(2, limited)
-def broken(): return 1 / 0
 VALUE = 3
 
 def maker(task, *, device):
@@ -114,7 +113,7 @@ def folder(tmp_path, monkeypatch):
     yield tmp_path
     if "more_tasks" in sys.modules:
         del sys.modules["more_tasks"].gymnasium.registry["InAFile-v0"]
-    for name in ("my_file", "more_tasks", "misses_one"):
+    for name in ("my_file", "more_tasks", "misses_one", "raises"):
         sys.modules.pop(name, None)
 
 
@@ -286,11 +285,26 @@ def test_a_path_that_leads_nowhere_is_refused_in_one_line(folder, path, message)
         import_task(path)
 
 
-def test_mistakes_in_the_users_code_keep_their_own_error(folder):
-    with pytest.raises(ModuleNotFoundError, match="a_module_that_is_not_there"):
-        import_task("misses_one:make")
-    with pytest.raises(ZeroDivisionError):
-        import_task("more_tasks:broken")
+@pytest.mark.parametrize(
+    ("path", "cause", "what"),
+    [
+        ("misses_one:make", ModuleNotFoundError, "No module named 'a_module_that_is_not_there' (misses_one.py, line 1)"),
+        ("leaves:make", SystemExit, "0 (leaves.py, line 2)"),
+        ("no_python:make", SyntaxError, "'(' was never closed (no_python.py, line 1)"),
+        ("raises:divides", ZeroDivisionError, "division by zero (raises.py, line 1)"),
+        ("raises:looks_up", KeyError, "'nothing' (raises.py, line 5)"),
+        ("raises:asks", TypeError, "asks() missing 1 required positional argument: 'size'"),
+    ],
+)
+def test_what_the_users_code_raises_is_named_with_its_line(folder, path, cause, what):
+    (folder / "leaves.py").write_text("import sys\nsys.exit(0)\n")
+    (folder / "no_python.py").write_text("make = (\n")
+    functions = ("def divides(): return 1 / 0", "def asks(size): return None", "def looks_up():", "    def inner():")
+    (folder / "raises.py").write_text("\n".join([*functions, "        return {}['nothing']", "    return inner()"]))
+    with pytest.raises(ValueError) as caught:
+        import_task(path)
+    assert str(caught.value) == f"task {path!r}: {cause.__name__}: {what}"
+    assert type(caught.value.__cause__) is cause
 
 
 def test_an_environment_that_is_returned_twice_is_refused(folder):

@@ -78,6 +78,13 @@ def test_with_neither_key_every_plan_is_cold_and_the_planner_warns_once(make_pla
         out = run(planner, td)  # warnings are errors here
 
 
+def test_the_warning_of_a_cold_start_is_of_the_line_that_calls_the_planner(make_planner, states):
+    for _ in range(2):  # Python shows a warning once for each line
+        with pytest.warns(UserWarning, match=_WARNING) as warned:
+            make_planner(warm_start=True)(TensorDict({"observation": states(2)}, batch_size=[2]))
+        assert warned[0].filename == __file__
+
+
 def test_without_warm_start_nothing_is_read_written_or_warned_of(make_planner, states, run, expected_plan):
     planner, observation = make_planner(), states(2)
     carried = torch.rand(2, 3, 2, dtype=torch.float64)

@@ -425,6 +425,10 @@ REFUSED_AT_ONCE = [
         "total_env_steps must exceed the random phase of 44 env steps, got 44; raise the budget or lower "
         "replay.seed_decisions.",
     ),
+    (
+        {"total_env_steps": 50, "num_envs": 30, "replay__seed_decisions": 20},
+        "total_env_steps must exceed the random phase of 60 env steps, got 50; raise the budget or lower num_envs.",
+    ),
     *(
         ({name: 0}, f"{name} must be at least 1, got 0.")
         for name in (

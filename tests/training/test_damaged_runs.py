@@ -116,6 +116,16 @@ def test_a_save_that_failed_half_way_leaves_nothing_out_of_the_next_one(tmp_path
     assert (expected == actual).all()
 
 
+def test_a_run_that_cannot_be_saved_at_all_ends_before_anything_is_lost(tmp_path, small_config, make_run):
+    run = make_run(small_config(), tmp_path)
+    part = run.parts["late"] = Refusing()
+    part.refuses = True
+    expected = f"no checkpoint can be written into {run.checkpoints.store.folder} (No space left on device); make room, "
+    with pytest.raises(OSError, match=f"^{re.escape(expected)}or choose another run_dir.$"):
+        run.run()
+    assert run.env_steps == 0
+
+
 def fill(disk: Path) -> None:
     with (disk / "ballast").open("wb", buffering=0) as file:
         for size in (2**20, 2**12, 1):

@@ -7,8 +7,10 @@ import dataclasses
 import itertools
 import math
 import os
+import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,6 +42,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     read_run_config,
 )
 from torchrl_etdmpc.training.ray_cluster import RayCluster  # noqa: E402
+from torchrl_etdmpc.training.signals import RunInterrupted  # noqa: E402
 
 TINY: dict[str, Any] = {
     "task": "gym/Pendulum-v1",
@@ -415,6 +418,11 @@ def test_what_goes_on_from_a_checkpoint_numbers_its_workers_on(started):
             {"workers": 8, "rows_per_batch": 2, "replay": {"seed_decisions": 24, "capacity": 47}},
             "replay.capacity must be at least 48 with workers=8 ",
         ),
+        (
+            {"rows_per_batch": 300},
+            "total_env_steps must exceed the random phase of 300 env steps, got 200; raise the budget or lower "
+            "rows_per_batch.",
+        ),
         ({"num_envs": 2}, "num_envs must be 1 with workers, got 2: each worker has one environment; raise workers."),
         ({"overlap": True}, "overlap must be false with workers, got true: workers step while the learner updates"),
         (
@@ -517,6 +525,31 @@ def test_two_processes_collect_every_row_for_a_slow_learner_and_none_is_left(tmp
     assert int(rows[-1]["env_steps"]) == 200 and int(rows[-1]["updates"]) == 5 + 160
     assert 0 <= float(rows[-1]["weight_age"]) < 60 and float(rows[-1]["target_age"]) >= 0
     assert processes_of(os.getpid()) <= before
+
+
+@pytest.mark.parametrize("batches", [3, 12])
+def test_a_signal_is_obeyed_while_the_workers_hang(tmp_path, monkeypatch, batches):
+    """In the random phase, which has five batches, and after it."""
+    goes_on, answered = threading.Event(), []
+
+    class Hanging(Workers):
+        def __iter__(self) -> Iterator[TensorDictBase]:
+            every = super().__iter__()
+            yield from itertools.islice(every, batches)
+            os.kill(os.getpid(), signal.SIGTERM)
+            answered.append(goes_on.wait(60))
+            yield from every
+
+    monkeypatch.setattr(
+        distributed, "start_workers", lambda parts, *, engine, numbers, rows: Hanging(parts, numbers, rows, None, 0)
+    )
+    run_dir = tmp_path / "run"
+    made = 8 * batches
+    with pytest.raises(RunInterrupted, match=rf"^stopped at {made} env steps and saved in {re.escape(str(run_dir))}; go"):
+        launch(config_of(run_dir=str(run_dir), workers=1))
+    assert not answered
+    goes_on.set()
+    assert CheckpointStore(RunDirectory(run_dir).checkpoints).newest_step() == made
 
 
 @pytest.mark.slow

@@ -9,7 +9,15 @@ from typing import Any
 
 from torchrl_etdmpc.envs import Task, get_task
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
-from torchrl_etdmpc.training import TASK_SETTINGS, Agent, TrainConfig, build_planner, config_of, read_agent_file
+from torchrl_etdmpc.training import (
+    TASK_SETTINGS,
+    Agent,
+    TrainConfig,
+    build_planner,
+    config_of,
+    load_agent,
+    read_agent_file,
+)
 from torchrl_etdmpc.training.config import PlannerConfig
 
 
@@ -42,6 +50,27 @@ class AgentCommandConfig:
         if self.task is not None and self.task != stored.task:
             return get_task(self.task, **(_task_settings(stored) | _task_settings(self)))
         return dataclasses.replace(stored.task_spec, **_task_settings(self))
+
+    def load(self, **options: Any) -> tuple[Agent, TrainConfig, dict[str, Any]]:
+        """The agent, as :func:`~torchrl_etdmpc.training.load_agent` loads it.
+
+        Args:
+            **options: of that function.
+
+        Raises:
+            ValueError: if code is named that the agent was not trained with, which would change nothing.
+        """
+        stored = trained_with(self.checkpoint)
+        own = {"score": stored.planner.score, "reanalyze_score": stored.reanalyze.score}
+        for name, trained in (own | {"extra_terms": stored.loss.extra_terms}).items():
+            given = getattr(self, name)
+            if given not in (None, trained):
+                another = f", or plan with another score: planner.score={given}" if name == "score" else ""
+                raise ValueError(
+                    f"{name} must be what the agent was trained with, {trained or 'null'}, got {given}; leave it "
+                    f"out{another}."
+                )
+        return load_agent(self.checkpoint, compile_setting="off", **options)
 
     @property
     def changed_task(self) -> dict[str, Any]:

@@ -295,7 +295,7 @@ def _readable(setting: Setting, value: str) -> str:
         return f"'{escaped}'"
     if not value:
         raise ValueError(f"{setting.name} must not be empty.")
-    if not re.fullmatch(r"[\w.+-]+", value):
+    if not re.fullmatch(r"[\w.+-]+", value, re.ASCII):
         kinds = {int: "a whole number", float: "a number", bool: "true or false"}
         options = typing.get_args(setting.hint) or (setting.hint,)
         kind = next((kinds[option] for option in options if option in kinds), "text")
@@ -341,7 +341,7 @@ def _import_own_code(arguments: list[str]) -> None:
         try:
             if name in given and given[name] != "null":
                 settings[name] = _TRUTH[given[name].lower()] if name == "terminates" else int(float(given[name]))
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, OverflowError) as error:
             if _SWEEP_FLAGS & set(sys.argv):  # several values, which are checked run by run
                 continue
             kind = "true or false" if name == "terminates" else "a whole number"

@@ -21,7 +21,7 @@ from torchrl_etdmpc.planners import BarePolicy
 from torchrl_etdmpc.runs import progress_bar, write_film
 from torchrl_etdmpc.runs.files import make_folder_of, write_whole
 from torchrl_etdmpc.runs.video import film_writer
-from torchrl_etdmpc.training import load_agent, resolve_device
+from torchrl_etdmpc.training import resolve_device
 from torchrl_etdmpc.training.config import MOST_EPISODES
 
 GIF_SIZE = 200  # pixels, for a page
@@ -71,7 +71,7 @@ def main(config: EvaluateConfig) -> None:
     device = resolve_device(config.device)
     task = config.task_spec
     env = make_env(task, seed=config.seed, num_envs=config.episodes, parallel=False)  # side by side
-    agent, trained, counters = load_agent(config.checkpoint, **env_sizes(env), device=device, compile_setting="off")
+    agent, trained, counters = config.load(**env_sizes(env), device=device)
     if config.policy == "planner":
         policy = config.planner_of(agent)
         env = env.append_transform(policy.make_tensordict_primer())

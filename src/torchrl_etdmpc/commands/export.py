@@ -13,7 +13,6 @@ from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.planners import export_planner, export_policy
 from torchrl_etdmpc.runs import replacing
 from torchrl_etdmpc.runs.files import make_folder
-from torchrl_etdmpc.training import load_agent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +33,12 @@ class ExportConfig(AgentCommandConfig):
 def main(config: ExportConfig) -> None:
     """Writes an agent's policy and planner as programs that run where only PyTorch is installed."""
     out = Path(config.out).expanduser()
-    agent, run, _ = load_agent(config.checkpoint, compile_setting="off")
-    make_folder(out)
+    agent, run, _ = config.load()
     if config.task not in (None, run.task):
         raise ValueError(f"task must be that of the checkpoint, {run.task!r}, got {config.task!r}; leave it out.")
+    for name in config.changed_task:
+        raise ValueError(f"task.{name} changes nothing of a policy or a planner; leave it out.")
+    make_folder(out)
     model = agent.acting_model
     assert model.observation_dim is not None  # training takes vectors
     policy = export_policy(model)

@@ -22,7 +22,7 @@ from torchrl_etdmpc.inspector.page import make_page, serve
 from torchrl_etdmpc.inspector.saved_page import free_folder, plotly_script, write_page
 from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.runs.files import make_folder
-from torchrl_etdmpc.training import load_agent, resolve_device
+from torchrl_etdmpc.training import resolve_device
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ def _inspection(config: InspectConfig) -> Inspection:
         )
     _need_no_renderer(task)
     sizes = {} if config.state.startswith("replay") else _sizes(task)  # a row of the buffer needs no simulator
-    agent, _, counters = load_agent(config.checkpoint, device=device, compile_setting="off", **sizes)
+    agent, _, counters = config.load(device=device, **sizes)
     path = Path(config.checkpoint).expanduser()
     about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
     changed = {"changed_task": config.changed_task} if config.changed_task else {}

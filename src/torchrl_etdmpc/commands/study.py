@@ -28,7 +28,7 @@ from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.runs import first_line, library_versions, processor, progress_bar, replacing
 from torchrl_etdmpc.runs.files import make_folder, write_whole
-from torchrl_etdmpc.training import load_agent, resolve_device
+from torchrl_etdmpc.training import resolve_device
 
 StudyName = Literal[
     "all",
@@ -82,7 +82,7 @@ def _main(config: StudyConfig) -> None:
         raise ImportError("this command needs matplotlib; run: pip install matplotlib")
     task, device = config.task_spec, resolve_device(config.device)
     env = make_env(task, seed=config.seed)
-    agent, _, counters = load_agent(config.checkpoint, **env_sizes(env), device=device, compile_setting="off")
+    agent, _, counters = config.load(**env_sizes(env), device=device)
     env.close(raise_if_closed=False)
     digest, changed = checksum(config.checkpoint), config.changed_task  # now: a run that goes on replaces the file
     folder = Path(config.out).expanduser()

@@ -155,6 +155,9 @@ def _observation(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) ->
         if vectors:
             for number in (each for each in vectors if not _shape(env, specs[each])):
                 yield f"{_text(number)} is a single number (append UnsqueezeTransform(-1, in_keys=[{number!r}]))"
+            if len({specs[each].dtype for each in vectors}) > 1:  # CatTensors' spec has the first one's
+                for each in vectors:
+                    yield from _dtype(each, specs[each], dtype, "in_keys")
             yield f"{name} is missing (append CatTensors(in_keys={vectors}, out_key={key!r}))"
         elif any(_is_pixels(env, leaf) for _, leaf in entries):
             yield f"{name} is missing, and pixel observations are not supported"
@@ -195,7 +198,8 @@ def _action(env: EnvBase, key: NestedKey, size: int, dtype: torch.dtype) -> Iter
     if spec.domain != "continuous":
         return
     if len(shape) != 1:
-        yield f"{_text(key)} has the shape {list(shape)} instead of [A]"
+        flatten = f" (append FlattenAction({-len(shape)}, -1, in_keys_inv=[{key!r}]))" if shape else ""
+        yield f"{_text(key)} has the shape {list(shape)} instead of [A]{flatten}"
     elif size not in (_ANY_SIZE, shape[0]):
         yield (
             f"{_text(key)} has {shape[0]} entries instead of the model's {size} (build the model with "

@@ -7,6 +7,7 @@ import importlib
 import math
 import os
 import sys
+import traceback
 import weakref
 from collections.abc import Callable
 from functools import partial
@@ -58,7 +59,7 @@ def import_task(
         Task: the task, with the path as its name.
 
     Raises:
-        ValueError: if nothing can be found there, or if it is not a task or an environment.
+        ValueError: if nothing can be found there, the code raises, or it is not a task or an environment.
 
     >>> import_task("no.such.module:make")
     Traceback (most recent call last):
@@ -96,7 +97,7 @@ def import_attribute(path: str, setting: str) -> Any:
         setting (str): what names the path, for messages.
 
     Raises:
-        ValueError: if nothing can be found there, or something else.
+        ValueError: if nothing can be found there, the module raises, or it is something else.
 
     >>> import_attribute("math:floor", "planner.score")(2.5)
     2
@@ -112,11 +113,14 @@ def import_attribute(path: str, setting: str) -> Any:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise  # the user's module was found, and misses another one
+            # The user's module was found, and misses another one.
+            raise ValueError(f"{setting} {path!r}: {_raised(error)}") from error
         hint = f"; write {module_name[:-3]}:{attribute}" if module_name.endswith(".py") else ""
         raise ValueError(
             f"{setting} {path!r}: there is no module {module_name!r} on Python's path or in {here}{hint}."
         ) from error
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{setting} {path!r}: {_raised(error)}") from error
     found = getattr(module, attribute, None)
     if found is None:
         where = getattr(module, "__file__", None) or "built in"
@@ -125,6 +129,16 @@ def import_attribute(path: str, setting: str) -> Any:
         kind = "a function or a Task" if setting == "task" else "a function"
         raise ValueError(f"{setting} {path!r} must be {kind}, got {type(found).__name__}.")
     return found
+
+
+def _raised(error: BaseException) -> str:
+    """What a user's code raised, and the line of its file; a syntax error tells its own."""
+    ours = (__file__, importlib.__file__)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename not in ours]
+    frames = [frame for frame in frames if not frame.filename.startswith("<frozen")]
+    own = [frame for frame in frames if frame.filename == frames[0].filename]
+    place = f" ({os.path.basename(own[-1].filename)}, line {own[-1].lineno})" if own else ""
+    return ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]]) + place
 
 
 def _make_as(name: str, make: Maker, task: Task, *, device: torch.device | str) -> EnvBase:
@@ -171,7 +185,10 @@ def _require_agreement(task: Task, env: EnvBase) -> None:
 
 
 def _call(function: Callable[[], EnvBase], path: str) -> EnvBase:
-    env = function()
+    try:
+        env = function()
+    except Exception as error:
+        raise ValueError(f"task {path!r}: {_raised(error)}") from error
     if not isinstance(env, EnvBase):
         remedy = "; return GymWrapper(env), of torchrl.envs" if hasattr(env, "action_space") else ""
         raise ValueError(f"task {path!r} must return a TorchRL environment, got {type(env).__name__}{remedy}.")

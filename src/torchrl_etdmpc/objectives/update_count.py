@@ -57,7 +57,7 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
 
     A step is what every pipeline has: a target average is not there in a loss without values, and a backward pass need
     not be followed by a step. Where several optimisers share the networks out, that of the first one counts, from
-    its first step on.
+    its first step on; of several that hold the first network each does.
 
     A line that counts by hand is harmless: after a step that somebody else has counted, the next one is not counted
     again, so that such a pipeline is one ahead and stays so.

@@ -400,7 +400,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 warnings.warn(
                     f"{self.plan_mean_key!r} is not in the planner's input, so every plan starts cold; append "
                     "planner.make_tensordict_primer() to the environment or pass warm_start=False.",
-                    stacklevel=3,
+                    stacklevel=6,  # who called the module
                 )
             return None, is_init is not None
         if carried.shape[-2:] != (self.horizon, self.world_model.action_dim):

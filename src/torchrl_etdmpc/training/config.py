@@ -314,10 +314,13 @@ class TrainConfig:
         )
         together = max(self.decisions_per_step, 1)
         seed_env_steps = -(-self.seed_decisions // together) * together * task.action_repeat
+        lower = "replay.seed_decisions" + " or task.episode_length" * bool(self.episode_length)
+        if together > self.seed_decisions:
+            lower = "num_envs" if together == self.num_envs else "rows_per_batch"
         _require(
             self.total_env_steps > seed_env_steps,
             f"total_env_steps must exceed the random phase of {seed_env_steps} env steps, got {self.total_env_steps}; "
-            f"raise the budget or lower replay.seed_decisions{' or task.episode_length' * bool(self.episode_length)}.",
+            f"raise the budget or lower {lower}.",
         )
         _require(
             self.seed_decisions >= slice_len * self.num_envs,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from torchrl_etdmpc.training.agent import Agent
 from torchrl_etdmpc.training.compilation import resolve_compile
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.ray_cluster import RayCluster
+from torchrl_etdmpc.training.signals import WorkLeftError
 from torchrl_etdmpc.training.workers import (
     Actor,
     Engine,
@@ -29,6 +30,7 @@ from torchrl_etdmpc.training.workers import (
     known_here,
     send_weights,
     start_workers,
+    waited_for,
     why_it_failed,
 )
 
@@ -119,6 +121,9 @@ class WorkerCollector:
         replay_buffer (ReplayBuffer): where rows go.
         exclude_keys (sequence of NestedKey): what is not stored.
 
+    Attributes:
+        while_waiting (callable): called every half second of waiting for a batch; it may raise to leave.
+
     Raises:
         ImportError, OSError, ValueError: if there is no Ray, or not the cluster that is asked for.
 
@@ -140,6 +145,7 @@ class WorkerCollector:
     ) -> None:
         self.config, self.agent, self.env, self.replay_buffer = config, agent, env, replay_buffer
         self.exclude_keys = (*exclude_keys, (NEXT, WORKER))
+        self.while_waiting: Callable[[], None] = lambda: None
         agent.planner.make_tensordict_primer().check(env)
         self._cluster = RayCluster(config.address, workers=config.workers) if config.engine == "ray" else None
         self._frames = 0
@@ -192,9 +198,12 @@ class WorkerCollector:
             SimulatorError: if a worker failed, or its rows do not continue those before; the next call of :meth:`act`
                 starts all of them anew.
             NonFiniteError: if a row is not finite; likewise.
+            WorkLeftError: if ``while_waiting`` raises it; nothing is stored.
         """
         try:
-            rows = next(self._batches).reshape(-1)
+            rows = waited_for(lambda: next(self._batches), self.while_waiting).reshape(-1)
+        except WorkLeftError:
+            raise
         except Exception as error:
             raise self._failed(error) from error
         rows = rows[: self.config.total_decisions - self._frames]  # the last batch may be more than the budget

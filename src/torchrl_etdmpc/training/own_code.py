@@ -33,7 +33,7 @@ def follow_own_code(name: str, value: str) -> None:
 
     >>> follow_own_code("planner.score", "mean")  # no path, so nothing is imported
     """
-    if name in OWN_CODE and (":" in value or (name.endswith("extra_terms") and value != "null")):
+    if name in OWN_CODE and (":" in value or (not name.endswith(".score") and value != "null")):
         _followed[OWN_CODE[name], value] = import_attribute(value, name)
 
 

@@ -76,11 +76,19 @@ class RunCheckpoints:
 
         Returns:
             bool: whether it was written.
+
+        Raises:
+            OSError: if the first one cannot be: there would be nothing to go on from, and nothing is lost yet.
         """
         try:
             self._write()
         except OSError as error:
             reason, steps = error.strerror or str(error), self.learner.env_steps
+            if not steps:
+                raise OSError(
+                    f"no checkpoint can be written into {self.store.folder} ({reason}); make room, or choose another "
+                    "run_dir."
+                ) from error
             warnings.warn(f"no checkpoint at {steps} env steps ({reason}); training goes on.", stacklevel=2)
             return False
         return True

@@ -20,6 +20,10 @@ class RunInterrupted(Exception):
     """The run was asked to stop; the text says whether it is saved."""
 
 
+class WorkLeftError(Exception):
+    """A signal came during work that can be left as it is: nothing of it counts yet."""
+
+
 class StopSignals:
     """Notes the first signal; a second one ends the process at once.
 
@@ -51,6 +55,15 @@ class StopSignals:
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before = {}
+
+    def leave_work(self) -> None:
+        """Leaves work that may take long, if a signal has come.
+
+        Raises:
+            WorkLeftError: then.
+        """
+        if self.requested:
+            raise WorkLeftError
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name

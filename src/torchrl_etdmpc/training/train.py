@@ -18,16 +18,13 @@ from torchrl_etdmpc.envs import success_return
 from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
 from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.distributed import WorkerCollector
 from torchrl_etdmpc.training.evaluator import Evaluator
 from torchrl_etdmpc.training.learner import Learner
 from torchrl_etdmpc.training.precompile import precompile
 from torchrl_etdmpc.training.run_checkpoints import RandomState, RunCheckpoints
 from torchrl_etdmpc.training.run_state import Duty, RunState
-from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals
-
-
-class _EvaluationLeftError(Exception):
-    """A signal came while the agent was evaluated."""
+from torchrl_etdmpc.training.signals import RunInterrupted, StopSignals, WorkLeftError
 
 
 class TrainingRun:
@@ -78,6 +75,8 @@ class TrainingRun:
         )
         self.state = RunState()
         self.stop = StopSignals() if stop is None else stop
+        if isinstance(collector, WorkerCollector):
+            collector.while_waiting = self.stop.leave_work
         file = AgentFile(agent, config, self.counters)
         self.best = BestAgent(file, log.directory.best_agent)
         self.parts: dict[str, Part] = {
@@ -159,7 +158,7 @@ class TrainingRun:
         total = self.config.seed_decisions
         with progress_bar("random phase", total, "decisions", initial=collector.frames) as progress:
             while collector.in_seed_phase:
-                self.learner.step()
+                self._step()
                 self._after_work()
                 progress.update(collector.frames)
         self.state.stage = "pretrain"
@@ -182,12 +181,19 @@ class TrainingRun:
         with progress_bar("learning", config.total_env_steps, "env steps", initial=self.env_steps) as progress:
             while self.env_steps < config.total_env_steps:
                 tick = time.perf_counter()
-                made = self.learner.step(updates=True)
+                made = self._step(updates=True)
                 state.learning_s += time.perf_counter() - tick
                 if made:
                     self._note_duties()
                 self._after_work()
                 progress.update(self.env_steps, self._note())
+
+    def _step(self, *, updates: bool = False) -> bool:
+        """A step of the learner, or none if a signal comes while it waits for workers."""
+        try:
+            return self.learner.step(updates=updates)
+        except WorkLeftError:
+            return False
 
     def _note(self) -> str:
         """What the bar says besides its steps; a narrow terminal has no room for the speed."""
@@ -239,7 +245,7 @@ class TrainingRun:
         try:
             with progress_bar("evaluation", steps, "decisions", passing=True) as progress:
                 result = self.evaluator(on_step=lambda _: self._on_evaluation_step(progress))
-        except _EvaluationLeftError:
+        except WorkLeftError:
             self._stop_if_asked()  # with training's random numbers; the evaluation is repeated from its beginning
             return
         except Exception as error:
@@ -258,8 +264,7 @@ class TrainingRun:
 
     def _on_evaluation_step(self, progress: ProgressBar) -> None:
         progress.advance()
-        if self.stop.requested:
-            raise _EvaluationLeftError
+        self.stop.leave_work()
 
     def write_row(self) -> None:
         """Appends a row to ``train.csv``: means over the interval, and counts since the run began."""

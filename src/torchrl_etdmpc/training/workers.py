@@ -9,9 +9,10 @@ import sys
 import threading
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -35,6 +36,7 @@ from torchrl_etdmpc.training.config import TASK_SETTINGS, TrainConfig
 from torchrl_etdmpc.training.own_code import follow_own_code
 
 Engine = Literal["multi", "ray"]
+T = TypeVar("T")
 
 _LOOK_EVERY_S = 0.5
 # How long a process may take to say that it has the weights; a thread of its own does, whatever it is busy with.
@@ -202,27 +204,45 @@ def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int 
     Raises:
         RuntimeError: if a worker has ended, or a process does not answer for five minutes.
     """
-    raised: list[BaseException] = []
-
-    def send() -> None:
-        try:
-            collector.update_policy_weights_(weights, worker_ids=None if worker is None else [worker])
-        except BaseException as error:
-            raised.append(error)
-
-    # TorchRL waits for the answer of a worker that has died for ever.
-    sender = threading.Thread(target=send, daemon=True)
-    sender.start()
     deadline = time.monotonic() + (_PATIENCE_S if hasattr(collector, "procs") else math.inf)
-    while sender.is_alive():
-        sender.join(_LOOK_EVERY_S)
+
+    def look() -> None:
         ended = ended_worker(collector)
         if ended is not None:
             raise RuntimeError(ended)
         if time.monotonic() > deadline:
             raise RuntimeError(f"it has not answered for {_PATIENCE_S} seconds")
+
+    places = None if worker is None else [worker]
+    # TorchRL waits for the answer of a worker that has died for ever.
+    waited_for(lambda: collector.update_policy_weights_(weights, worker_ids=places), look)
+
+
+def waited_for(call: Callable[[], T], look: Callable[[], None]) -> T:
+    """What a call returns that may never return: a thread of its own makes it, and is left where ``look`` raises.
+
+    Args:
+        call (callable): made once.
+        look (callable): called every half second meanwhile.
+    """
+    returned: list[T] = []
+    raised: list[BaseException] = []
+
+    def make() -> None:
+        try:
+            returned.append(call())
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=make, daemon=True)
+    thread.start()
+    thread.join(_LOOK_EVERY_S)
+    while thread.is_alive():
+        look()
+        thread.join(_LOOK_EVERY_S)
     if raised:
         raise raised[0]
+    return returned[0]
 
 
 def ended_worker(collector: BaseCollector) -> str | None:
@@ -230,7 +250,8 @@ def ended_worker(collector: BaseCollector) -> str | None:
     for number, process in enumerate(getattr(collector, "procs", ())):
         with contextlib.suppress(ValueError):  # TorchRL has closed it
             if process.exitcode is not None:
-                return f"worker {number} ended (exit code {process.exitcode})"
+                raised = "; its own error stands above" if process.exitcode == 1 else ""
+                return f"worker {number} ended (exit code {process.exitcode}{raised})"
     return None
 
 
