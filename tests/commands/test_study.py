@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -144,7 +145,6 @@ def test_all_makes_every_study(tmp_path, checkpoint, study):
 
 
 def test_every_study_has_a_function_of_its_name_and_the_three_others():
-    
     for name in NAMES:
         module = importlib.import_module(f"torchrl_etdmpc.inspector.studies.{name}")
         assert all(callable(getattr(module, part)) for part in (name, "table", "lines", "figure"))

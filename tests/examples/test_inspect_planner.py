@@ -145,7 +145,7 @@ def test_an_agent_of_another_task_is_refused(checkpoint, run_main, play):
 def test_a_folder_of_other_files_is_refused_before_any_work(checkpoint, run_main, tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "index.html").write_text("mine")
-    work = "torchrl_etdmpc.commands.inspect_planner.load_agent"
+    work = "torchrl_etdmpc.commands.agent_command.load_agent"
     monkeypatch.setattr(work, lambda *_, **__: pytest.fail("the agent was read"))
     message, _, _ = run_main(f"checkpoint={checkpoint}", "save=mine")
     assert message == "error: save=mine holds other files; choose an empty or a new folder."

@@ -171,7 +171,7 @@ REFUSED = [
     ("task=mymodule:", "task 'mymodule:' must read package.module:attribute."),
     ("task=mymodule:make_my_env", "task 'mymodule:make_my_env' shows no time limit; give one in env steps: task.epis"),
     ("task=mymodule:make_nothing", "task 'mymodule:make_nothing' must return a TorchRL environment, got int."),
-    ("task=mymodule:fail", "the licence server does not answer"),
+    ("task=mymodule:fail", "task 'mymodule:fail': RuntimeError: the licence server does not answer (mymodule.py, line"),
     ("task=mymodule:make_unscaled", "task 'mymodule:make_unscaled': this environment cannot be used as it is: action"),
     (
         "task=mymodule:make_limited task.episode_length=500",

@@ -246,7 +246,7 @@ def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(
 ):
     run = make_run(small_config(), small_disk / "run")
     stop_at(run, run.learner.collector, "act", 30)
-    fill(small_disk)
+    at_decisions(run, {20: lambda: fill(small_disk)})
     expected = r"^stopped at \d+ env steps and not saved: the checkpoint before it stays in "
     with pytest.warns(UserWarning) as warned, pytest.raises(RunInterrupted, match=expected):
         run.run()

@@ -138,7 +138,8 @@ def _raised(error: BaseException) -> str:
     frames = [frame for frame in frames if not frame.filename.startswith("<frozen")]
     own = [frame for frame in frames if frame.filename == frames[0].filename]
     place = f" ({os.path.basename(own[-1].filename)}, line {own[-1].lineno})" if own else ""
-    return ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]]) + place
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}{text and ': '}{text}{place}"
 
 
 def _make_as(name: str, make: Maker, task: Task, *, device: torch.device | str) -> EnvBase:
