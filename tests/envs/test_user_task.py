@@ -107,7 +107,7 @@ def folder(tmp_path, monkeypatch):
     """A user's directory, in which commands run; what they import is forgotten."""
     (tmp_path / "my_file.py").write_text(_RECIPE)
     (tmp_path / "more_tasks.py").write_text(_MORE)
-    (tmp_path / "misses_one.py").write_text("import a_module_that_is_not_there\n")
+    (tmp_path / "misses_one.py").write_text("import not_there\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
     yield tmp_path
@@ -288,7 +288,7 @@ def test_a_path_that_leads_nowhere_is_refused_in_one_line(folder, path, message)
 @pytest.mark.parametrize(
     ("path", "cause", "what"),
     [
-        ("misses_one:make", ModuleNotFoundError, "No module named 'a_module_that_is_not_there' (misses_one.py, line 1)"),
+        ("misses_one:make", ModuleNotFoundError, "No module named 'not_there' (misses_one.py, line 1)"),
         ("leaves:make", SystemExit, "0 (leaves.py, line 2)"),
         ("no_python:make", SyntaxError, "'(' was never closed (no_python.py, line 1)"),
         ("raises:divides", ZeroDivisionError, "division by zero (raises.py, line 1)"),

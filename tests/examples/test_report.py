@@ -180,15 +180,14 @@ def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_inter
     assert not list(Path().glob(".report*"))
 
 
-@pytest.mark.parametrize(
-    "name", [*(f"a/walker-walk/seed1/{file}" for file in ("config.yaml", "eval.csv", "summary.json")), "experiment.yaml"]
-)
+@pytest.mark.parametrize("name", ["config.yaml", "eval.csv", "summary.json", "experiment.yaml"])
 def test_watching_notices_what_a_report_reads(name):
     root = make_experiment()
     arguments = argparse.Namespace(runs=[str(root)])
     before = report.stamp(arguments)
     assert report.stamp(arguments) == before
-    (root / name).write_text((root / name).read_text() + "\n")
+    file = next(path for path in (root / name, root / "a" / "walker-walk" / "seed1" / name) if path.exists())
+    file.write_text(file.read_text() + "\n")
     assert report.stamp(arguments) != before
 
 

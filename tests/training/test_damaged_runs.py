@@ -120,8 +120,8 @@ def test_a_run_that_cannot_be_saved_at_all_ends_before_anything_is_lost(tmp_path
     run = make_run(small_config(), tmp_path)
     part = run.parts["late"] = Refusing()
     part.refuses = True
-    expected = f"no checkpoint can be written into {run.checkpoints.store.folder} (No space left on device); make room, "
-    with pytest.raises(OSError, match=f"^{re.escape(expected)}or choose another run_dir.$"):
+    expected = f"no checkpoint can be written into {run.checkpoints.store.folder} (No space left on device); make "
+    with pytest.raises(OSError, match=f"^{re.escape(expected)}room, or choose another run_dir.$"):
         run.run()
     assert run.env_steps == 0
 

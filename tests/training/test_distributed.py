@@ -543,9 +543,8 @@ def test_a_signal_is_obeyed_while_the_workers_hang(tmp_path, monkeypatch, batche
     monkeypatch.setattr(
         distributed, "start_workers", lambda parts, *, engine, numbers, rows: Hanging(parts, numbers, rows, None, 0)
     )
-    run_dir = tmp_path / "run"
-    made = 8 * batches
-    with pytest.raises(RunInterrupted, match=rf"^stopped at {made} env steps and saved in {re.escape(str(run_dir))}; go"):
+    run_dir, made = tmp_path / "run", 8 * batches
+    with pytest.raises(RunInterrupted, match=f"^stopped at {made} env steps and saved in {re.escape(str(run_dir))}; "):
         launch(config_of(run_dir=str(run_dir), workers=1))
     assert not answered
     goes_on.set()
