@@ -122,7 +122,8 @@ class WorkerCollector:
         exclude_keys (sequence of NestedKey): what is not stored.
 
     Attributes:
-        while_waiting (callable): called every half second of waiting for a batch; it may raise to leave.
+        while_waiting (callable): called every half second of waiting for a batch; a ``WorkLeftError`` of it ends the
+            wait, and nothing is stored.
 
     Raises:
         ImportError, OSError, ValueError: if there is no Ray, or not the cluster that is asked for.
@@ -198,7 +199,6 @@ class WorkerCollector:
             SimulatorError: if a worker failed, or its rows do not continue those before; the next call of :meth:`act`
                 starts all of them anew.
             NonFiniteError: if a row is not finite; likewise.
-            WorkLeftError: if ``while_waiting`` raises it; nothing is stored.
         """
         try:
             rows = waited_for(lambda: next(self._batches), self.while_waiting).reshape(-1)
