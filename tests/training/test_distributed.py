@@ -527,18 +527,27 @@ def test_two_processes_collect_every_row_for_a_slow_learner_and_none_is_left(tmp
     assert processes_of(os.getpid()) <= before
 
 
-@pytest.mark.parametrize("batches", [3, 12])
-def test_a_signal_is_obeyed_while_the_workers_hang(tmp_path, monkeypatch, batches):
+@pytest.mark.parametrize(("where", "batches"), [("batch", 3), ("batch", 12), ("weights", 5)])
+def test_a_signal_is_obeyed_while_the_workers_hang(tmp_path, monkeypatch, where, batches):
     """In the random phase, which has five batches, and after it."""
     goes_on, answered = threading.Event(), []
+
+    def hang() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        answered.append(goes_on.wait(60))
 
     class Hanging(Workers):
         def __iter__(self) -> Iterator[TensorDictBase]:
             every = super().__iter__()
             yield from itertools.islice(every, batches)
-            os.kill(os.getpid(), signal.SIGTERM)
-            answered.append(goes_on.wait(60))
+            if where == "batch":
+                hang()
             yield from every
+
+        def update_policy_weights_(self, weights: TensorDictBase, worker_ids: list[int] | None = None) -> None:
+            if where == "weights" and weights["planning"]:
+                hang()
+            super().update_policy_weights_(weights, worker_ids)
 
     monkeypatch.setattr(
         distributed, "start_workers", lambda parts, *, engine, numbers, rows: Hanging(parts, numbers, rows, None, 0)

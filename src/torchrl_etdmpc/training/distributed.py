@@ -122,7 +122,7 @@ class WorkerCollector:
         exclude_keys (sequence of NestedKey): what is not stored.
 
     Attributes:
-        while_waiting (callable): called every half second of waiting for a batch; a ``WorkLeftError`` of it ends the
+        while_waiting (callable): called every half second of waiting for workers; a ``WorkLeftError`` of it ends the
             wait, and nothing is stored.
 
     Raises:
@@ -186,6 +186,8 @@ class WorkerCollector:
                 self._send(None)
             elif self._planning:
                 self._send(self._last_worker)
+        except WorkLeftError:
+            raise
         except Exception as error:
             raise self._failed(error) from error
 
@@ -249,7 +251,8 @@ class WorkerCollector:
         weights = live.data.cpu().clone()  # in memory that may be shared
         if number is not None and self.config.engine == "multi":
             number = None  # they read the same memory
-        send_weights(self._workers, weights, None if number is None else number - self._numbers.start)
+        place = None if number is None else number - self._numbers.start
+        send_weights(self._workers, weights, place, while_waiting=self.while_waiting)
         self._sent |= dict.fromkeys(self._numbers if number is None else [number], updates)
 
     def _failed(self, error: BaseException) -> Exception:

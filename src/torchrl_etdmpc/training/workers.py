@@ -193,7 +193,13 @@ def start_workers(parts: WorkerParts, *, engine: Engine, numbers: range, rows: i
         )
 
 
-def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int | None = None) -> None:
+def send_weights(
+    collector: BaseCollector,
+    weights: TensorDictBase,
+    worker: int | None = None,
+    *,
+    while_waiting: Callable[[], None] = lambda: None,
+) -> None:
     """Sends weights to a worker, and waits until it has them.
 
     Args:
@@ -201,12 +207,16 @@ def send_weights(collector: BaseCollector, weights: TensorDictBase, worker: int 
         weights (TensorDictBase): of an :class:`Actor`; nobody else may hold their memory.
         worker (int, optional): its place. Default: all of them.
 
+    Keyword Args:
+        while_waiting (callable): called every half second meanwhile; what it raises ends the wait.
+
     Raises:
         RuntimeError: if a worker has ended, or a process does not answer for five minutes.
     """
     deadline = time.monotonic() + (_PATIENCE_S if hasattr(collector, "procs") else math.inf)
 
     def look() -> None:
+        while_waiting()
         ended = ended_worker(collector)
         if ended is not None:
             raise RuntimeError(ended)
