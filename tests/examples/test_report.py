@@ -750,6 +750,7 @@ def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
     assert "- walker-walk was run with episode_length=100, not as the benchmark has it.\n" in page
     assert "- Nothing published stands beside walker-walk: returns of other episodes do not compare.\n" in page
     assert "BMPC |" not in page
+    assert "(quoted)" not in page
     assert not Path("out", "aggregate.png").exists()
 
 
