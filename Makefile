@@ -26,7 +26,7 @@ SAME_RUN = $(if $(filter command line,$(origin RUN_DIR)), RUN_DIR="$(RUN_DIR)",$
 TYPED = $(if $(filter command line,$(origin $1)),$2)
 GOES_ON = $(if $(filter resume=true resume=auto resume=weights,$(ARGS)),$(shell test -e "$(RUN_DIR)/config.yaml" && echo yes))
 OF_RUN = $(call TYPED,TASK,task=$(TASK)) $(call TYPED,THREADS,threads=$(THREADS))
-OF_NEW_RUN = task=$(TASK) preset=cpu threads=$(THREADS) seed=1 total_env_steps=20000 eval_every=5000
+OF_NEW_RUN = task=$(TASK) preset=cpu threads=$(THREADS) seed=1 total_env_steps=20000 eval_every=5000 eval_episodes=5
 
 .DEFAULT_GOAL := help
 .PHONY: help train watch report test lint bench docs docs-serve humanoidbench clean
