@@ -101,7 +101,13 @@ TRAINED = "must be what the agent was trained with"
         (study, "study=all reanalyze_score=my_ideas:cautious", f"reanalyze_score {TRAINED}, final, got my_ideas:caut"),
         (export, "extra_terms=my_ideas:terms", f"extra_terms {TRAINED}, null, got my_ideas:terms; leave it out."),
         (inspect_planner, "extra_terms=my_ideas:terms", f"extra_terms {TRAINED}, null, got my_ideas:terms; leave it"),
-        (evaluate, "score=final", "score 'final' must read package.module:attribute."),
+        (
+            evaluate,
+            "score=final",
+            "score must be the path of the code that the agent was trained with, got 'final'; say planner.score=final "
+            "to plan with another score.",
+        ),
+        (evaluate, "score=cautious", "score 'cautious' must read package.module:attribute."),
         (export, "task.episode_length=20", "task.episode_length changes nothing of a policy or a planner; leave it"),
         (export, "task=gym/Acrobot-v1", "task must be that of the checkpoint, 'gym/Pendulum-v1', got 'gym/Acrobot-v1'"),
     ],

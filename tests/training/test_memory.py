@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.training import PRESETS, TrainConfig  # noqa: E402
+from torchrl_etdmpc.training import PRESETS, TrainConfig, build_world_model  # noqa: E402
+from torchrl_etdmpc.training.config import ReplayConfig  # noqa: E402
 from torchrl_etdmpc.training.memory import require_memory  # noqa: E402
 
 BUDGET = {"total_env_steps": 10**14}
@@ -41,3 +44,15 @@ def test_the_plans_of_all_episodes_of_an_evaluation_are_made_at_once(monkeypatch
     require_memory(TrainConfig(), 24, 6, torch.device("cpu"))
     with pytest.raises(ValueError, match=r"^planner\.\* would take "):
         require_memory(TrainConfig(eval_episodes=1000), 24, 6, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("name", ["efficient-tdmpc", "tdmpc2"])
+def test_weights_count_with_their_targets_gradients_and_moments(monkeypatch, name):
+    config = dataclasses.replace(PRESETS[name], replay=ReplayConfig(capacity=10_000, pretrain_policy=name == "tdmpc2"))
+    model = build_world_model(config.model, observation_dim=24, action_dim=6)
+    once = sum(parameter.numel() * parameter.element_size() for parameter in model.parameters())
+    monkeypatch.setattr("torchrl_etdmpc.training.memory._memory_bytes", lambda device: 5.5 * once)
+    require_memory(config, 24, 6, torch.device("cpu"))
+    monkeypatch.setattr("torchrl_etdmpc.training.memory._memory_bytes", lambda device: 4.5 * once)
+    with pytest.raises(ValueError, match=r"^model\.\* would take "):
+        require_memory(config, 24, 6, torch.device("cpu"))

@@ -267,6 +267,9 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
+    _step_setting = "num_envs"
+    """The setting that says how many decisions come together; a class attribute and no setting itself."""
+
     def __post_init__(self) -> None:
         _check_types(self)
         check_device(self.device)
@@ -316,7 +319,7 @@ class TrainConfig:
         seed_env_steps = -(-self.seed_decisions // together) * together * task.action_repeat
         lower = "replay.seed_decisions" + " or task.episode_length" * bool(self.episode_length)
         if together > self.seed_decisions:
-            lower = "num_envs" if together == self.num_envs else "rows_per_batch"
+            lower = self._step_setting
         _require(
             self.total_env_steps > seed_env_steps,
             f"total_env_steps must exceed the random phase of {seed_env_steps} env steps, got {self.total_env_steps}; "
@@ -379,7 +382,7 @@ class TrainConfig:
     @property
     def decisions_per_step(self) -> int:
         """Decisions that come together."""
-        return self.num_envs
+        return getattr(self, self._step_setting)
 
     @property
     def total_decisions(self) -> int:

@@ -57,6 +57,8 @@ class DistributedConfig(TrainConfig):
     send_every: int = 10
     """Updates after which a worker that has sent its rows gets the weights anew."""
 
+    _step_setting = "rows_per_batch"
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, most in {"workers": 4096, "rows_per_batch": 100_000, "send_every": None}.items():
@@ -88,11 +90,6 @@ class DistributedConfig(TrainConfig):
             if value != needed:
                 must, got = (str(word).lower() for word in (needed, value))
                 raise ValueError(f"{name} must be {must} with workers, got {got}: {why}.")
-
-    @property
-    def decisions_per_step(self) -> int:
-        """Decisions that come together."""
-        return self.rows_per_batch
 
 
 def is_distributed(settings: Any) -> bool:

@@ -52,7 +52,8 @@ def _parameters(model: ModelConfig, observation_dim: int, action_dim: int) -> in
     encoder = model.encoder_dim * (observation_dim + (model.encoder_layers - 1) * model.encoder_dim + model.latent_dim)
     dynamics = model.mlp_dim * (2 * model.latent_dim + action_dim + model.mlp_dim)
     head = model.mlp_dim * (model.latent_dim + action_dim + model.mlp_dim + model.num_bins)
-    return encoder + model.num_dynamics * (dynamics + head) + model.num_values * head
+    policy = model.mlp_dim * (model.latent_dim + model.mlp_dim + 2 * action_dim)
+    return encoder + model.num_dynamics * dynamics + (1 + model.num_values) * head + policy
 
 
 def _plan_bytes(model: ModelConfig, planner: PlannerConfig, states: int) -> int:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Callable
 from typing import Any
 
 from torchrl_etdmpc.envs import import_attribute
+from torchrl_etdmpc.planners import ScoreName
 
 OWN_CODE = {
     "planner.score": "planner.score",
@@ -29,10 +31,15 @@ def follow_own_code(name: str, value: str) -> None:
         value (str): its value.
 
     Raises:
-        ValueError: if there is nothing at the path.
+        ValueError: if there is nothing at the path, or ``score`` names one of the package's scores.
 
     >>> follow_own_code("planner.score", "mean")  # no path, so nothing is imported
     """
+    if name == "score" and value in typing.get_args(ScoreName):
+        raise ValueError(
+            f"score must be the path of the code that the agent was trained with, got {value!r}; say "
+            f"planner.score={value} to plan with another score."
+        )
     if name in OWN_CODE and (":" in value or (not name.endswith(".score") and value != "null")):
         _followed[OWN_CODE[name], value] = import_attribute(value, name)
 
