@@ -57,7 +57,7 @@ def main() -> None:
                 write(NEW_ROWS)
                 refresh(REFRESHED)
             tick = time.perf_counter()
-            store.save(number, parts, buffer, version=int(agent.world_model.version))
+            store.save(number, parts, buffer)
             seconds.append(time.perf_counter() - tick)
             sizes.append(sum(file.stat().st_size for file in (Path(folder) / "replay").iterdir()))
         other = build_replay(config, sizes=HUMANOID)

@@ -34,6 +34,7 @@ from torchrl_etdmpc import (
     export_planner,
 )
 from torchrl_etdmpc.functional import simnorm
+from torchrl_etdmpc.modules.new_weights import draw_new_weights
 from torchrl_etdmpc.objectives import EfficientTDMPCModelLoss
 from torchrl_etdmpc.testing import random_slices
 from torchrl_etdmpc.training import Updater
@@ -228,6 +229,17 @@ def test_a_layer_that_cannot_draw_new_weights_is_named():
     model = WorldModel(None, 1, encoder=Scale(), latent_dim=16, mlp_dim=16)
     with pytest.raises(TypeError, match=r"reset_parameters\(\) in every layer with parameters, got Scale without"):
         model.reset_parameters_recursive()
+
+
+def test_new_weights_are_drawn_for_pytorch_s_attention():
+    torch.manual_seed(0)
+    layer = nn.TransformerEncoderLayer(8, 2, 16)
+    draw_new_weights(layer)
+    drawn = {name: value.clone() for name, value in layer.named_parameters()}
+    draw_new_weights(layer)
+    moved = [name for name, value in layer.named_parameters() if not torch.equal(value, drawn[name])]
+    assert {"self_attn.in_proj_weight", "self_attn.out_proj.weight", "linear1.weight"} <= {*moved}
+    assert not layer.self_attn.out_proj.bias.any()  # as PyTorch begins
 
 
 def test_an_exported_planner_needs_an_example_of_what_is_no_vector():

@@ -47,6 +47,10 @@ class Pipeline:
         """Rows of an episode that was planned long ago, by the first weights."""
         self.write(count, version=0)
 
+    def reset(self, count: int) -> None:
+        """New weights: the next targets carry versions that older ones have, too."""
+        self.version = 0
+
     def refresh(self, count: int) -> None:
         index = torch.randperm(len(self.buffer))[:count]
         patch = {("plan", "loc"): torch.randn(len(index), 2), ("plan", "scale"): torch.rand(len(index), 2)}
@@ -67,7 +71,7 @@ def assert_same(buffer: TensorDictReplayBuffer, other: TensorDictReplayBuffer) -
     }
 
 
-ACTIONS = ["write", "write_late", "refresh", "save", "reload"]
+ACTIONS = ["write", "write_late", "refresh", "reset", "save", "reload"]
 STEPS = st.lists(st.tuples(st.sampled_from(ACTIONS), st.integers(1, 12)), max_size=25)
 
 
@@ -79,12 +83,12 @@ def test_what_is_loaded_is_what_was_saved(tmp_path_factory, steps, capacity, rew
     run.write(3)
     for action, number in [*steps, ("save", 0)]:
         if action == "save":
-            files = json.loads(json.dumps(journal.save(run.buffer, version=run.version)))
+            files = json.loads(json.dumps(journal.save(run.buffer)))
             copy = make_buffer(capacity)
             ReplayJournal(folder).load(copy, files)
             assert_same(run.buffer, copy)
         elif action == "reload":  # a run that goes on from its last state, in a new process
-            files = journal.save(run.buffer, version=run.version)
+            files = journal.save(run.buffer)
             journal, copy = ReplayJournal(folder, rewrite_at=rewrite_at), make_buffer(capacity)
             journal.load(copy, files)
             run.buffer = copy
@@ -98,12 +102,66 @@ def test_targets_of_new_rows_are_saved_however_old_the_version_that_made_them_is
     run, journal = Pipeline(make_buffer(capacity)), ReplayJournal(tmp_path)
     run.version = 7
     run.write(10)
-    journal.save(run.buffer, version=run.version)
+    journal.save(run.buffer)
     run.write(5, version=2)
-    files = journal.save(run.buffer, version=run.version)
+    files = journal.save(run.buffer)
     copy = make_buffer(capacity)
     ReplayJournal(tmp_path).load(copy, files)
     assert_same(run.buffer, copy)
+
+
+@pytest.mark.parametrize("version", [0, 1, 5, 9])
+def test_targets_of_weights_that_began_anew_are_saved(tmp_path, version):
+    """After a reset, or from weights that were loaded, versions go back, and may be those of the targets before."""
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10, version=5)
+    run.version = 9
+    journal.save(run.buffer)
+    run.version = version
+    run.refresh(10)
+    copy = make_buffer()
+    ReplayJournal(tmp_path).load(copy, journal.save(run.buffer))
+    assert_same(run.buffer, copy)
+
+
+@pytest.mark.parametrize("name", ["version", "value", "scale"])
+def test_targets_may_lack_what_no_part_reads(tmp_path, name):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10)
+    rows = run.buffer.storage[:].clone().exclude(("plan", name))
+    buffer = make_buffer()
+    buffer.extend(rows)
+    journal.save(buffer)
+    buffer.storage[:]["plan", "loc"][3] = 7.0
+    copy = make_buffer()
+    ReplayJournal(tmp_path).load(copy, journal.save(buffer))
+    assert_same(buffer, copy)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_what_has_not_changed_is_not_written_again(tmp_path, again):
+    run, journal = Pipeline(make_buffer(12)), ReplayJournal(tmp_path)
+    run.write(20)
+    run.refresh(5)
+    first = journal.save(run.buffer)
+    if again:  # a run that goes on
+        journal, run.buffer = ReplayJournal(tmp_path), make_buffer(12)
+        journal.load(run.buffer, first)
+    assert journal.save(run.buffer) == first
+    assert len([*tmp_path.iterdir()]) == len(first["rows"]) + len(first["targets"])
+
+
+def test_one_bit_of_a_target_is_a_change(tmp_path):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path, rewrite_at=1.0)
+    run.write(10)
+    loc = run.buffer.storage[:]["plan", "loc"]
+    loc[0, 1], loc[1, 1] = 0.0, float("nan")
+    journal.save(run.buffer)
+    loc[0, 1], loc[1, 1], loc[2, 1] = -0.0, float("nan"), float("inf")
+    loc[4, 0] = torch.nextafter(loc[4, 0], torch.tensor(9.0))
+    loc[6] = loc[6].flip(0)
+    files = journal.save(run.buffer)
+    assert [entry["rows"] for entry in files["targets"]] == [10, 4]  # rows 0, 2, 4 and 6
 
 
 def test_older_states_stay_loadable_until_they_are_pruned(tmp_path):
@@ -112,7 +170,7 @@ def test_older_states_stay_loadable_until_they_are_pruned(tmp_path):
     for _ in range(5):
         run.write(9)
         run.refresh(4)
-        states.append((journal.save(run.buffer, version=run.version), run.buffer.storage[:].clone()))
+        states.append((journal.save(run.buffer), run.buffer.storage[:].clone()))
     for files, wanted in states:
         copy = make_buffer(30)
         ReplayJournal(tmp_path).load(copy, files)
@@ -132,12 +190,12 @@ def test_older_states_stay_loadable_until_they_are_pruned(tmp_path):
 def test_a_buffer_that_was_emptied_is_saved_as_it_is_now(tmp_path, count):
     run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
     run.write(10)
-    journal.save(run.buffer, version=run.version)
+    journal.save(run.buffer)
     run.buffer.empty()
     if count:
         run.write(count)
         run.refresh(3)
-    files = journal.save(run.buffer, version=run.version)
+    files = journal.save(run.buffer)
     copy = make_buffer()
     ReplayJournal(tmp_path).load(copy, files)
     assert len(copy) == min(count, 50)
@@ -218,11 +276,11 @@ def test_a_write_count_that_is_not_the_buffer_s_is_refused(tmp_path):
 def test_a_save_writes_what_is_new_and_not_the_buffer(tmp_path):
     run, journal = Pipeline(make_buffer(5000), observation_dim=48), ReplayJournal(tmp_path)
     run.write(4000)
-    journal.save(run.buffer, version=run.version)
+    journal.save(run.buffer)
     before = {file: file.stat().st_size for file in tmp_path.iterdir()}
     run.write(10)
     run.refresh(20)
-    files = journal.save(run.buffer, version=run.version)
+    files = journal.save(run.buffer)
     added = sum(file.stat().st_size for file in tmp_path.iterdir() if file not in before)
     assert added < 0.05 * sum(before.values())
     assert all(file.stat().st_size == size for file, size in before.items())
@@ -236,7 +294,7 @@ def test_many_changes_are_gathered_so_that_the_files_stay_about_as_large_as_the_
     for _ in range(30):
         run.refresh(1500)
         run.write(250)
-        files = journal.save(run.buffer, version=run.version)
+        files = journal.save(run.buffer)
         journal.prune([files])
     size = sum(file.stat().st_size for file in tmp_path.iterdir())
     assert size < 1.2 * run.buffer.storage[:].bytes()
@@ -279,12 +337,12 @@ def test_what_goes_on_in_a_larger_buffer_is_loaded_as_it_was_saved(tmp_path_fact
     folder = tmp_path_factory.mktemp("journal")
     run = Pipeline(make_buffer(30))
     run.write(written)
-    files, capacity = ReplayJournal(folder).save(run.buffer, version=run.version), 30 + more
+    files, capacity = ReplayJournal(folder).save(run.buffer), 30 + more
     journal, run.buffer = ReplayJournal(folder), make_buffer(capacity)
     journal.load(run.buffer, files)
     for action, number in [*steps, ("refresh", 30), ("save", 0)]:
         if action in ("save", "reload"):
-            files, copy = journal.save(run.buffer, version=run.version), make_buffer(capacity)
+            files, copy = journal.save(run.buffer), make_buffer(capacity)
             ReplayJournal(folder).load(copy, files)
             assert_same(run.buffer, copy)
         else:
@@ -318,9 +376,9 @@ def test_a_damaged_file_is_named(tmp_path, part, how):
 def test_rows_that_came_after_a_part_s_base_are_not_salvaged_without_their_targets(tmp_path, lost):
     run, journal = Pipeline(make_buffer(90)), ReplayJournal(tmp_path)
     run.write(24)  # parts of 30 rows
-    journal.save(run.buffer, version=run.version)
+    journal.save(run.buffer)
     run.write(10)
-    files = journal.save(run.buffer, version=run.version)
+    files = journal.save(run.buffer)
     base, change, _ = files["targets"]
     assert [(entry["part"], entry["rows"]) for entry in files["targets"]] == [(0, 24), (0, 6), (1, 4)]
     damage(tmp_path / {"base": base, "change": change}[lost]["file"], "missing")
@@ -335,7 +393,7 @@ def test_rows_that_came_after_a_part_s_base_are_not_salvaged_without_their_targe
 def test_a_file_that_cannot_be_written_leaves_nothing_and_the_journal_as_it_was(tmp_path, monkeypatch):
     run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
     run.write(10)
-    first = journal.save(run.buffer, version=run.version)
+    first = journal.save(run.buffer)
     run.write(10)
 
     def full(descriptor: int) -> None:
@@ -343,9 +401,9 @@ def test_a_file_that_cannot_be_written_leaves_nothing_and_the_journal_as_it_was(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        journal.save(run.buffer, version=run.version)
+        journal.save(run.buffer)
     monkeypatch.undo()
     assert {file.name for file in tmp_path.iterdir()} == {e["file"] for p in ("rows", "targets") for e in first[p]}
     copy = make_buffer()
-    ReplayJournal(tmp_path).load(copy, journal.save(run.buffer, version=run.version))
+    ReplayJournal(tmp_path).load(copy, journal.save(run.buffer))
     assert_same(run.buffer, copy)

@@ -46,7 +46,7 @@ def test_targets_that_were_made_anew_come_back_wherever_they_are(tmp_path, key):
     store.save(1, {}, buffer)
     rows = buffer.storage[:].clone().set(key, target(3))
     buffer.storage.set(torch.arange(5), rows, set_cursor=False)
-    store.save(2, {}, buffer, version=3)
+    store.save(2, {}, buffer)
     other = make()
     CheckpointStore(tmp_path, plan_key=key).load({}, other)
     assert (other.storage[:] == buffer.storage[:]).all()
@@ -92,7 +92,7 @@ def store(tmp_path: Path) -> CheckpointStore:
 def save(store: CheckpointStore, step: int, work: Work, **options: Any) -> str:
     """Returns the state that was saved."""
     links = {store.folder / "last.pt": "layer"}
-    folder = store.save(step, work.parts, work.buffer, **{"version": work.counter.number, "links": links} | options)
+    folder = store.save(step, work.parts, work.buffer, **{"links": links} | options)
     assert folder == store.folder / "resume" / f"{step:012d}"
     return work.state()
 

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 from torchrl.data import (
     Binary,
@@ -919,6 +919,13 @@ def test_a_non_finite_value_is_named_with_its_step_and_not_stored(broken, source
         collector.step()
     assert len(replay) == collector.frames == 5
     assert all(value.isfinite().all() for value in replay.storage[:].values(True, True) if value.is_floating_point())
+
+
+def test_a_policy_that_writes_no_action_is_answered_with_what_it_wrote():
+    policy = TensorDictModule(lambda observation: observation, in_keys=["observation"], out_keys=["torque"])
+    collector = StepCollector(LineEnv(4), policy, replay_buffer=make_replay())
+    with pytest.raises(KeyError, match=r"the policy wrote no 'action'; it wrote \[.*'torque'"):
+        collector.step()
 
 
 @pytest.mark.parametrize("resets", [1, 2], ids=["first-reset", "later-reset"])

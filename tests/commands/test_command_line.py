@@ -149,6 +149,7 @@ def test_a_sweep_leaves_no_folder_but_those_of_its_runs(run_command, tmp_path, m
         ("csv=a.csv", "csv='${seed}/a.csv'"),
         ("video=films/a.mp4", "video='films/${seed}/a.mp4'"),
         ("video=~/a.gif", "video='/somewhere/${seed}/a.gif'"),
+        ("csv=~/a.csv", "csv='/somewhere/${seed}/a.csv'"),
     ],
 )
 def test_no_two_runs_of_a_sweep_write_the_same_file(run_command, monkeypatch, output, remedy):

@@ -98,14 +98,15 @@ TRAINED = "must be what the agent was trained with"
             f"score {TRAINED}, mean, got my_ideas:cautious; leave it out, or plan with another score: "
             "planner.score=my_ideas:cautious.",
         ),
+        (study, "study=all score=my_ideas:cautious", f"score {TRAINED}, mean, got my_ideas:cautious; leave it out."),
         (study, "study=all reanalyze_score=my_ideas:cautious", f"reanalyze_score {TRAINED}, final, got my_ideas:caut"),
         (export, "extra_terms=my_ideas:terms", f"extra_terms {TRAINED}, null, got my_ideas:terms; leave it out."),
         (inspect_planner, "extra_terms=my_ideas:terms", f"extra_terms {TRAINED}, null, got my_ideas:terms; leave it"),
         (
             evaluate,
             "score=final",
-            "score must be the path of the code that the agent was trained with, got 'final'; say planner.score=final "
-            "to plan with another score.",
+            "score must be the path of the code that the agent was trained with, got 'final'; leave it out. With "
+            "evaluate and inspect_planner, planner.score=final plans with another score.",
         ),
         (evaluate, "score=cautious", "score 'cautious' must read package.module:attribute."),
         (export, "task.episode_length=20", "task.episode_length changes nothing of a policy or a planner; leave it"),

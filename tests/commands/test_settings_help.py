@@ -51,6 +51,13 @@ def test_the_main_help_holds_usage_main_settings_defaults_and_groups_in_80_colum
     assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.parametrize("columns", ["1", "20", "37"])
+def test_a_narrow_terminal_gets_help_too(monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    assert "  total_env_steps=200000 " in help_text(TrainConfig, "Trains.", "python examples/train.py")
+    assert "planner.horizon=6" in help_text(TrainConfig, "", "", ("planner",))
+
+
 def test_a_group_or_one_setting_can_be_asked_for():
     text = help_text(TrainConfig, "", "", ("planner",))
     assert "planner.horizon=6" in text

@@ -350,6 +350,8 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
         (("a=",), "runs are PATH or NAME=PATH, and neither may be empty, got 'a='."),
         (("=runs",), "runs are PATH or NAME=PATH, and neither may be empty, got '=runs'."),
         (("--grid-step", "1"), "--grid-step=1 makes more than 1,000 points of "),
+        (("--budget", f"{10**18}"), "--grid-step=100000 makes more than 1,000 points of 1,000,000,000,000,000,000 env"),
+        (("--budget", f"{10**400}"), "--grid-step=100000 makes more than 1,000 points of 1"),
         (("--grid-step", "300000"), "the grid needs at least two steps"),
         (("--budget", "250000", "--grid-step", "100000"), "the budget must be a multiple of the grid step"),
     ],
@@ -357,6 +359,22 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
 def test_an_option_that_makes_no_sense_is_refused(refused, arguments, message):
     make_run("runs/a")
     assert refused("runs", *arguments).startswith(message)
+
+
+def test_the_traceback_can_be_asked_for(run_main, monkeypatch):
+    monkeypatch.setenv("TORCHRL_ETDMPC_TRACEBACK", "1")
+    with pytest.raises(OSError, match="nowhere"):
+        run_main("nowhere")
+
+
+def test_a_baseline_of_unknown_seeds_shows_no_nan(run_main):
+    make_run("runs/a")
+    text = Path(make_baseline()).read_text().replace("standard_error,seeds", "standard_error").replace(",5\n", "\n")
+    Path("baseline.csv").write_text(text)
+    run_main("runs", "--reference", "baseline.csv")
+    page = Path("report/index.md").read_text()
+    assert "| walker-walk | BMPC | 50.0 | – | 1.0 | 48.0 to 52.0 | ? |" in page
+    assert "nan" not in page
 
 
 def test_a_run_without_configuration_and_summary_is_refused(refused):

@@ -287,6 +287,20 @@ def test_a_metric_that_has_no_mean_is_refused(make_loss, slices, metric, kind):
         loss(slices)
 
 
+def test_a_metric_of_another_shape_is_refused_with_a_mask_and_without(make_loss, slices):
+    def term(world_model, slices, rollout):
+        error = slices.action.square().mean(-1)
+        return error, {"seen": error.expand(5, *error.shape)}  # a head first
+
+    loss = make_loss("whole", extra_terms=[Term("mine", term, metrics=("mine_error", "seen"))])
+    for masked in (slices, slices.clone().set(("collector", "mask"), torch.ones(4, 3, dtype=torch.bool))):
+        with pytest.raises(
+            ValueError,
+            match=r"the metric 'seen' of .* must be of shape \[T, B\]=\[3, 4\] or a scalar, got \[5, 3",
+        ):
+            loss(masked)
+
+
 @pytest.mark.parametrize("name", ["rho", "scale_tau", "kl_direction"])
 def test_a_scalar_cannot_have_the_name_of_the_loss_s_own(world_model, name):
     with pytest.raises(ValueError, match=f"metrics and scalars must have names of their own, got '{name}'"):

@@ -109,6 +109,13 @@ def test_an_entry_that_does_not_fit_is_named(make_loss, slices, key, change, mes
         make_loss("whole")(slices)
 
 
+def test_an_entry_of_more_bits_than_the_weights_is_named_in_half_precision_too(make_loss, slices):
+    loss, half = make_loss("whole").bfloat16(), slices.apply(lambda x: x.bfloat16() if x.is_floating_point() else x)
+    half["action"] = half["action"].float()
+    with pytest.raises(ValueError, match=r"needs 'action' in torch.bfloat16, as the weights are, got torch.float32; c"):
+        loss(half)
+
+
 @pytest.mark.parametrize("kind", [torch.float32, torch.int64, torch.uint8])
 @pytest.mark.parametrize("replayed", [0.0, 0.5])
 def test_flags_of_other_kinds_count_as_flags(

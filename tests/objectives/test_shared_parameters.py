@@ -188,6 +188,19 @@ def test_a_world_model_that_was_cast_without_its_loss_is_noticed(make_loss, slic
     loss.double()(slices.double())
 
 
+def test_rewards_and_values_over_other_bins_are_refused(make_loss, make_world_model, kind):
+    state = make_loss(kind, make_world_model()).state_dict()
+    other = make_loss(kind, make_world_model(bin_min=-5.0, bin_max=5.0))
+    if kind == "policy":
+        other.load_state_dict(state)
+        return
+    with pytest.raises(RuntimeError, match="of another world model: its bins reach from -10 to 10, here from -5 to 5"):
+        other.load_state_dict(state)
+    make_loss(kind, make_world_model()).load_state_dict(make_loss(kind).bfloat16().state_dict())
+    state.pop("bins")  # a file of before
+    other.load_state_dict(state)
+
+
 @pytest.mark.parametrize(
     ("options", "fault"),
     [

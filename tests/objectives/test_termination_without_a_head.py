@@ -68,6 +68,17 @@ def test_the_policy_does_not_bootstrap_and_does_not_ask(make_world_model):
     assert loss(random_slices(5, 3, terminated=True))["loss_policy"].isfinite()
 
 
+def test_flags_without_a_dimension_of_their_own_are_read_step_by_step(make_world_model):
+    loss, batch = make("whole", make_world_model()), random_slices(5, 3, num_slices=4, slice_len=1)
+    flags = torch.tensor([[True], [False], [False], [False]])
+    batch["next", "terminated"] = flags
+    batch["collector", "mask"] = ~flags
+    assert loss(batch)["loss_reward"].isfinite()
+    batch["collector", "mask"] = ~flags.flip(0)
+    with pytest.raises(ValueError, match=r"^\('next', 'terminated'\) holds True"):
+        loss(batch)
+
+
 @pytest.mark.parametrize("reason", ["traced", "on a device"])
 def test_nothing_waits_for_the_flag_where_it_would_cost(make_world_model, monkeypatch, reason):
     loss, terminated = make("whole", make_world_model()), random_slices(5, 3, terminated=True)

@@ -174,6 +174,26 @@ def test_a_state_that_the_model_only_reads_is_refused(make_imagined):
         make(wrapper(), reward_key="gain")
 
 
+class Stepped(Imagined):
+    """Steps by itself, so that its specs alone say what it writes."""
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        place = tensordict["place"] + 0.5 * tensordict["action"]
+        written = {"place": place, ("hidden", "mark"): tensordict["hidden", "mark"], "reward": rewarded(place)}
+        done = torch.zeros_like(place, dtype=torch.bool)
+        return TensorDict(written | {"done": done, "terminated": done}, tensordict.batch_size)
+
+
+def test_a_wrong_name_in_an_environment_with_a_step_of_its_own_is_refused():
+    sizes = {"place": 1, ("hidden", "mark"): 1}
+    TorchRLModel(Stepped(), action_dim=1, state_sizes=sizes)
+    for options in ({"state_sizes": {"y": 1}}, {"state_sizes": sizes, "reward_key": "cost"}):
+        with pytest.raises(
+            ValueError, match=r"^the model does not write '(y|cost)', at .*; it writes \['place', .*'reward'"
+        ):
+            TorchRLModel(Stepped(), action_dim=1, **options)
+
+
 def prior(*out_keys: str) -> WorldModelWrapper:
     move = RSSMPrior(Bounded(-1, 1, (1,)), hidden_dim=8, rnn_hidden_dim=8, state_dim=2)
     move(torch.zeros(1, 2), torch.zeros(1, 8), torch.zeros(1, 1))

@@ -488,6 +488,13 @@ def test_a_transform_without_a_buffer_says_how_to_attach_it():
         reanalyze.refresh(sample)
 
 
+def test_a_sample_without_the_observation_is_refused():
+    buffer = make_buffer(40)
+    reanalyze = make_reanalyze(buffer)
+    with pytest.raises(KeyError, match="needs the observation 'observation' in the sample; store it, or name it by"):
+        reanalyze.refresh(buffer.sample().exclude("observation"))
+
+
 @pytest.mark.parametrize("missing", ["index", *TARGETS])
 def test_a_sample_without_targets_or_index_is_refused(missing):
     buffer = make_buffer(40)

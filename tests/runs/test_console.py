@@ -52,6 +52,20 @@ def test_without_tqdm_there_are_lines_too(monkeypatch, capsys):
     assert capsys.readouterr().out.endswith(" a word\n")
 
 
+@pytest.mark.parametrize("columns", ["1", "9"])
+def test_a_narrow_terminal_loses_no_line(monkeypatch, columns):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("COLUMNS", columns)
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    with console():
+        torchrl_logger.warning("a word of warning")
+    assert " ".join(terminal.getvalue().split()).endswith("a word of warning")
+
+
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), BrokenPipeError(), ValueError()])
 def test_what_cannot_be_shown_ends_nothing(monkeypatch, error):
     class Full(io.StringIO):

@@ -97,6 +97,22 @@ def test_a_run_begins_with_its_resolved_configuration_and_nothing_else(tmp_path)
     assert [path.name for path in directory.path.iterdir()] == ["config.yaml"]
 
 
+@pytest.mark.parametrize("again", ["begin", "go_on"])
+def test_what_a_kill_left_of_a_file_goes_and_other_people_s_files_stay(tmp_path, again):
+    directory = RunDirectory(tmp_path / "run")
+    if again == "go_on":
+        directory.begin(CONFIG)
+        directory.close()
+    directory.path.mkdir(exist_ok=True)
+    ours = [directory.path / f".{name}" for name in ("curve.0badcafe.partial.png", "config.0badcafe.partial.yaml")]
+    film = directory.path / ".film.0badcafe.partial.mp4"
+    for file in (*ours, film):
+        file.touch()
+    directory.begin(CONFIG) if again == "begin" else directory.go_on()
+    assert not any(file.exists() for file in ours)
+    assert film.exists()
+
+
 def test_a_run_may_begin_in_a_directory_that_holds_something_else(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     RunDirectory(tmp_path).begin(CONFIG)

@@ -177,11 +177,12 @@ def test_runs_are_spread_over_the_gpus_and_the_cores_over_the_runs(small, tmp_pa
 
     monkeypatch.setattr(local, "start", watched)
     stand_in({})
-    variants = {"any": {"device": "auto"}, "cpu": {}}
+    variants = {"any": {"device": "auto"}, "cpu": {}, "that one": {"device": "cuda:1"}}
     runs = small.experiment(variants=variants, seeds=(1, 2, 3, 4)).runs(tmp_path)
     assert run_locally(RunQueue(runs), per_gpu=2)
     assert {(threads, gpu) for variant, threads, gpu in given if variant == "any"} <= {(3, "3"), (3, "5")}
     assert {(threads, gpu) for variant, threads, gpu in given if variant == "cpu"} == {(3, None)}
+    assert {gpu for variant, _, gpu in given if variant == "that one"} == {None}  # it sees all, and takes the second
     assert {gpu for _, _, gpu in given} >= {"3", "5"}
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from torchrl_etdmpc.suites import RunQueue, Search, Sweep, read_progress, run_locally
+from torchrl_etdmpc.suites import sweep as module
 from torchrl_etdmpc.suites.attempt import last_verdict
 
 pytest.importorskip("optuna")
@@ -111,6 +112,13 @@ def test_a_range_of_a_setting_that_is_whole_holds_whole_numbers_however_its_ends
     settings = [sweep.propose()[0].config.optim for _ in range(4)]
     assert {type(one.batch_size) for one in settings} == {int}
     assert any(not one.grad_clip_norm.is_integer() for one in settings)
+
+
+@pytest.mark.parametrize("name", ["replay.seed_decisions", "task.episode_length", "replay.pretrain_updates"])
+def test_a_setting_that_may_be_null_is_whole_as_well(name):
+    assert Search({name: {"low": 1e3, "high": 5e3}}, trials=4).is_whole(name)
+    assert not Search({name: {"low": 1e3, "high": 5000.5}}, trials=4).is_whole(name)
+    assert not Search({"checkpoint_minutes": {"low": 1e3, "high": 5e3}}, trials=4).is_whole("checkpoint_minutes")
 
 
 def test_the_value_of_a_trial_is_the_mean_over_tasks_and_seeds_of_the_last_return(search, small, tmp_path):
@@ -283,6 +291,24 @@ def test_without_pruning_no_trial_ends_early(search, small, tmp_path):
         assert sweep.look() == []
         small.write_finished(run, returns=returns)
         sweep.look()
+
+
+def test_a_trial_that_another_suite_ends_meanwhile_ends_nothing_here(search, small, tmp_path, monkeypatch):
+    sweep, other = (Sweep(search(trials=2), "tuned", tmp_path) for _ in range(2))
+    (run,) = sweep.propose()
+    small.write_tables(run, 100)
+    evaluations = module._evaluations
+
+    def meanwhile(run):
+        other._tell(0, None)
+        return evaluations(run)
+
+    monkeypatch.setattr(module, "_evaluations", meanwhile)
+    assert sweep.look() == []
+    assert study_of(tmp_path).trials[0].state.name == "PRUNED"
+    monkeypatch.undo()
+    sweep.look()
+    assert sweep.runs() == []
 
 
 def test_what_was_pruned_is_marked_also_after_a_kill(search, small, tmp_path):

@@ -133,6 +133,7 @@ def test_auto_is_the_cuda_device_where_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("auto") == torch.device("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     current, precisions = [], []
     monkeypatch.setattr(torch.cuda, "set_device", current.append)
     monkeypatch.setattr(torch, "set_float32_matmul_precision", precisions.append)
@@ -141,6 +142,8 @@ def test_auto_is_the_cuda_device_where_there_is_one(monkeypatch):
     assert current == [torch.device("cuda", 1)]  # whose copies TensorDict waits for
     assert precisions == ["high", "high"]
     assert resolve_device("cpu") == torch.device("cpu")
+    with pytest.raises(ValueError, match=r"^device=cuda:2 is not there: this PyTorch sees 2 CUDA devices, "):
+        resolve_device("cuda:2")
     assert precisions == ["high", "high"]
 
 

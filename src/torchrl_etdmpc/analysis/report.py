@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from torchrl_etdmpc.analysis.statistics import (
     normalise,
 )
 from torchrl_etdmpc.analysis.steps import MEAN, overview, step_table
-from torchrl_etdmpc.analysis.tables import AGGREGATE, escape, result_table, to_csv, to_markdown
+from torchrl_etdmpc.analysis.tables import AGGREGATE, DASH, escape, result_table, to_csv, to_markdown
 from torchrl_etdmpc.runs.files import replacing
 
 FIGURES = ("curves", "aggregate", "auc")
@@ -278,9 +279,11 @@ def _intervals(comparison: Comparison) -> str:
     ]
     for task in comparison.tasks:
         for row in table[table["task"] == task].itertuples():
+            std = DASH if math.isnan(row.std) else f"{row.std:.1f}"
+            seeds = "?" if math.isnan(row.seeds) else f"{row.seeds:.0f}"
             lines.append(
-                f"| {task} | {escape(row.method)} | {row.mean:.1f} | {row.std:.1f} | {row.standard_error:.1f} | "
-                f"{row.lower:.1f} to {row.upper:.1f} | {row.seeds:.0f} |"
+                f"| {task} | {escape(row.method)} | {row.mean:.1f} | {std} | {row.standard_error:.1f} | "
+                f"{row.lower:.1f} to {row.upper:.1f} | {seeds} |"
             )
     return "\n".join(lines) + "\n"
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from types import MappingProxyType
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -19,14 +20,24 @@ ROWS_PER_FILE = 16_384
 PARTS = 3
 
 
+class _Saved(NamedTuple):
+    """What was written so far."""
+
+    files: Mapping[str, Any] = MappingProxyType({"written": 0, "rows": [], "targets": []})
+    last: tuple[int, TensorDictBase] | None = None
+    """Write number and content of the last row."""
+    fingerprints: Tensor = torch.zeros(0, dtype=torch.int64)
+    """Of the targets, row by row of the buffer."""
+
+
 class ReplayJournal:
     """Writes a buffer's rows once, and the planner targets that reanalyze rewrites as a base with changes.
 
     A transition never changes except for its targets. So every :meth:`save` appends a file with the rows written since
-    the last one, and files with the targets computed since then. The targets are kept in three parts; the one with the
-    most changes is written anew if they exceed a third of it, one part in a save. Files are never modified. What
-    belongs to one state of the buffer is listed in the dictionary that :meth:`save` returns; several such lists share
-    files, and :meth:`prune` removes what no list names.
+    the last one, and files with the targets that have changed since then, which their fingerprints tell, 8 bytes a row.
+    The targets are kept in three parts; the one with the most changes is written anew if they exceed a third of it, one
+    part in a save. Files are never modified. What belongs to one state of the buffer is listed in the dictionary that
+    :meth:`save` returns; several such lists share files, and :meth:`prune` removes what no list names.
 
     The buffer must be written in order (``add`` and ``extend``, one storage dimension), as
     :class:`~torchrl_etdmpc.collectors.StepCollector` does. One that was emptied is written whole again.
@@ -35,8 +46,8 @@ class ReplayJournal:
         folder (str or Path): made if missing.
 
     Keyword Args:
-        plan_key (NestedKey): group of the planner's targets, with the model version that they were computed by. Rows
-            without it are written once and never again. Default: ``"plan"``.
+        plan_key (NestedKey): group of the planner's targets. Rows without it are written once and never again. Default:
+            ``"plan"``.
         rewrite_at (float): share of changed targets at which a part is written anew. Default: 1/3.
 
     >>> import tempfile
@@ -56,19 +67,14 @@ class ReplayJournal:
         self.folder = Path(folder)
         self.rewrite_at = rewrite_at
         self._target_keys = [unravel_key((plan_key, name)) for name in TARGETS]
-        self._version_key = unravel_key((plan_key, "version"))
-        self.state: dict[str, Any] = _nothing()
-        self._last: tuple[int, TensorDictBase] | None = None
-        """Write number and content of the last row that was saved."""
+        self.saved = _Saved()
+        """What the next :meth:`save` goes on from; to put an earlier one back undoes the saves since."""
 
-    def save(self, buffer: TensorDictReplayBuffer, *, version: int = 0) -> dict[str, Any]:
+    def save(self, buffer: TensorDictReplayBuffer) -> dict[str, Any]:
         """Writes what is new.
 
         Args:
             buffer (TensorDictReplayBuffer): the same one at every call.
-
-        Keyword Args:
-            version (int): the model's version now; targets computed from now on carry at least this one.
 
         Returns:
             dict: what :meth:`load` needs, JSON-serialisable.
@@ -80,8 +86,9 @@ class ReplayJournal:
         """
         capacity, written = buffer.storage.max_size, _write_count(buffer)
         self.folder.mkdir(parents=True, exist_ok=True)
-        old = _nothing() if self._was_emptied(buffer, written) else self.state
-        new: dict[str, Any] = {"capacity": capacity, "written": written, "version": version}
+        saved = _Saved() if self._was_emptied(buffer, written) else self.saved
+        old, fingerprints = saved.files, saved.fingerprints
+        new: dict[str, Any] = {"capacity": capacity, "written": written}
         new["rows"] = [entry for entry in old["rows"] if entry["end"] > written - capacity]
         new["targets"] = old["targets"]
         if written:
@@ -95,10 +102,17 @@ class ReplayJournal:
                 entry = self._write(f"rows-{start:012d}", _rows(stored.exclude("index", *targets), position))
                 new["rows"] = [*new["rows"], entry | {"begin": start, "end": end}]
             if targets:
-                new["targets"] = self._save_targets(stored.select(*targets), old, begin, written, capacity)
-        self.state = new  # last: a failed save must leave the journal where it was, or those rows are never written
-        self._last = (written - 1, self._row(buffer, written - 1).clone()) if written else None
+                fingerprints = _fingerprints(stored.select(*targets))
+                changed = torch.ones_like(fingerprints, dtype=torch.bool)
+                before = saved.fingerprints.to(changed.device)
+                changed[: len(before)] = fingerprints[: len(before)] != before
+                new["targets"] = self._save_targets(stored.select(*targets), changed, old, written, capacity)
+        # Last: a failed save must leave the journal where it was, or those rows are never written.
+        self.saved = _Saved(new, self._last_row(buffer, written), fingerprints)
         return new
+
+    def _last_row(self, buffer: TensorDictReplayBuffer, written: int) -> tuple[int, TensorDictBase] | None:
+        return (written - 1, self._row(buffer, written - 1).clone()) if written else None
 
     def _row(self, buffer: TensorDictReplayBuffer, number: int) -> TensorDictBase:
         """What never changes of the row of a write number."""
@@ -110,9 +124,10 @@ class ReplayJournal:
 
         Flags do not count: a fault may have made that row the end of its episode.
         """
-        if self._last is None or self._last[0] < written - buffer.storage.max_size:
+        last = self.saved.last
+        if last is None or last[0] < written - buffer.storage.max_size:
             return False
-        number, row = self._last
+        number, row = last
         if number >= written:
             return True
         now = self._row(buffer, number)
@@ -122,15 +137,9 @@ class ReplayJournal:
         )
 
     def _save_targets(
-        self, stored: TensorDictBase, old: dict[str, Any], begin: int, written: int, capacity: int
+        self, stored: TensorDictBase, changed: Tensor, old: Mapping[str, Any], written: int, capacity: int
     ) -> list[dict[str, Any]]:
-        """Writes the targets that changed since the last save, or a whole part where too many have piled up.
-
-        A target says by its model version when it was computed. That finds what reanalyze rewrote, but not every new
-        row: one of the random phase has version 0 for ever. So the rows written since count as changed in any case.
-        """
-        changed = stored.get(self._version_key).reshape(len(stored)) >= old["version"]
-        changed[torch.arange(begin, written, device=changed.device) % capacity] = True
+        """Writes the targets that changed since the last save, or a whole part where too many have piled up."""
         size = -(-capacity // PARTS)
         # In a larger buffer than before, where parts have other bounds, all of them are written anew.
         known = old["targets"] if old.get("capacity") == capacity else []
@@ -178,10 +187,12 @@ class ReplayJournal:
                 f"be loaded into one of capacity {capacity}."
             )
         rows, position = TensorDict(), torch.arange(max(written - capacity, 0), written) % capacity
+        fingerprints = _Saved().fingerprints
         if written:
             rows = self._read_rows(files)
             targets = self._read_targets(files["targets"], len(rows))
             if targets is not None:
+                fingerprints = _fingerprints(targets)
                 rows.update(_rows(targets, position))
             rows.set("index", position)  # TensorDict buffers number their rows
         if len(buffer):  # it may hold more than was saved
@@ -194,8 +205,8 @@ class ReplayJournal:
                 times = (written - 1 - torch.arange(capacity)).div(capacity, rounding_mode="floor")
                 state["_generation"] = times.clamp(min=-1)
             buffer.writer.load_state_dict(state)
-        self.state = {key: files[key] for key in ("capacity", "written", "version", "rows", "targets")}
-        self._last = (written - 1, self._row(buffer, written - 1).clone()) if written else None
+        state = {key: files[key] for key in ("capacity", "written", "rows", "targets")}
+        self.saved = _Saved(state, self._last_row(buffer, written), fingerprints)
 
     def read_row(self, files: Mapping[str, Any], row: int) -> TensorDictBase:
         """One row, without its targets; of the files, the one that holds it is read.
@@ -257,7 +268,7 @@ class ReplayJournal:
             if targets is not None:
                 content.update(_rows(targets, position))
             buffer.extend(_rows(content, slice(begin, end)))
-        self.state, self._last = _nothing(), None
+        self.saved = _Saved()
         return faults
 
     def _read_rows(self, files: Mapping[str, Any]) -> TensorDictBase:
@@ -317,8 +328,20 @@ def _rows(stored: TensorDictBase, index: Tensor | slice) -> TensorDictBase:
     return stored[index]  # pyright: ignore[reportReturnType]  # typed as if it could be a leaf
 
 
-def _nothing() -> dict[str, Any]:
-    return {"written": 0, "version": 0, "rows": [], "targets": []}
+def _fingerprints(targets: TensorDictBase) -> Tensor:
+    """One int64 for the bits of every row: their sum with odd weights, modulo 2^64.
+
+    Two rows that differ in one number have different ones, others but for one chance in some 2^64.
+    """
+    draws = torch.Generator().manual_seed(0)
+    total = torch.zeros(len(targets), dtype=torch.int64, device=targets.device)
+    for key in sorted(targets.keys(True, True), key=str):
+        bits = targets.get(key).reshape(len(targets), -1).contiguous()
+        bits = bits.view(torch.int32 if bits.element_size() % 4 == 0 else torch.uint8)
+        odd = (torch.randint(-(2**62), 2**62, bits.shape[1:], generator=draws) * 2 + 1).to(bits.device)
+        for start in range(0, len(bits), ROWS_PER_FILE):  # products are twice as large as what they are of
+            total[start : start + ROWS_PER_FILE] += (bits[start : start + ROWS_PER_FILE] * odd).sum(-1)
+    return total
 
 
 def _write_count(buffer: TensorDictReplayBuffer) -> int:

@@ -101,7 +101,6 @@ class CheckpointStore:
         parts: Mapping[str, Part],
         buffer: TensorDictReplayBuffer,
         *,
-        version: int = 0,
         links: Mapping[Path, str] | None = None,
     ) -> Path:
         """Writes a checkpoint; what was saved before stays usable until the new one is in place.
@@ -113,7 +112,6 @@ class CheckpointStore:
             buffer (TensorDictReplayBuffer): the same one at every call.
 
         Keyword Args:
-            version (int): of the model; see :meth:`ReplayJournal.save`. Default: 0.
             links (mapping, optional): path to the name of the part whose file it becomes, e.g. ``last.pt`` the agent's.
 
         Returns:
@@ -125,11 +123,11 @@ class CheckpointStore:
         """
         target = self.folder / "resume" / f"{step:012d}"
         partial = target.with_name(f".{target.name}.partial")
-        before = self.journal.state
+        before = self.journal.saved
         try:
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
-            replay = self.journal.save(buffer, version=version)
+            replay = self.journal.save(buffer)
             files = {}
             for name, part in parts.items():
                 state = dict(part.state_dict())
@@ -146,7 +144,7 @@ class CheckpointStore:
             os.replace(partial, target)
             sync(target.parent)
         except BaseException:
-            self.journal.state = before  # its new files belong to nothing, and the next save must write those rows
+            self.journal.saved = before  # its new files belong to nothing, and the next save must write those rows
             shutil.rmtree(partial, ignore_errors=True)
             self._prune()
             raise
@@ -165,6 +163,7 @@ class CheckpointStore:
         Raises:
             CheckpointError: if there is none; its text says what is wrong with each. It is a
                 :class:`DamagedBufferError` where :meth:`salvage` may help.
+            ValueError: if rows do not fit into the buffer; see :meth:`ReplayJournal.load`.
         """
         faults, kind = [], CheckpointError
         for folder in reversed(self._folders()):

@@ -55,8 +55,8 @@ def evaluate(
     Raises:
         NonFiniteError: if the environment returns a reward or an observation that is not finite, or the policy an
             action.
-        ValueError: if ``episodes`` is not positive, or the environment does not fit the planner's model, e.g. because
-            its actions have other bounds.
+        ValueError: if ``episodes`` is not positive, or the environment has several rewards, or it does not fit the
+            planner's model, e.g. because its actions have other bounds.
 
     >>> from torchrl.envs import GymEnv, RewardSum, TransformedEnv
     >>> from torchrl.envs.utils import RandomPolicy

@@ -304,7 +304,9 @@ class StepCollector(BaseCollector):
 
     def _check_finite(self, tensordict: TensorDictBase, keys: Sequence[NestedKey], source: str) -> None:
         for key in keys:
-            value = tensordict.get(key)
+            value = tensordict.get(key, None)
+            if value is None:
+                raise KeyError(f"{source} wrote no {key!r}; it wrote {sorted(map(str, tensordict.keys(True, True)))}.")
             if value.is_floating_point() and not value.isfinite().all():
                 rows = value.isfinite().reshape(self.num_envs, -1).all(-1).logical_not().nonzero().flatten().tolist()
                 self._truncate_episodes()  # the environment may have moved on

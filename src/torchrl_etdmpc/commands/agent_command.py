@@ -65,7 +65,11 @@ class AgentCommandConfig:
         for name, trained in (own | {"extra_terms": stored.loss.extra_terms}).items():
             given = getattr(self, name)
             if given not in (None, trained):
-                another = f", or plan with another score: planner.score={given}" if name == "score" else ""
+                another = (
+                    f", or plan with another score: planner.score={given}"
+                    if name == "score" and hasattr(self, "planner")
+                    else ""
+                )
                 raise ValueError(
                     f"{name} must be what the agent was trained with, {trained or 'null'}, got {given}; leave it "
                     f"out{another}."

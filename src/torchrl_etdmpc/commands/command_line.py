@@ -166,9 +166,9 @@ _ELSEWHERE = {"workers": "distributed", "engine": "distributed", "address": "dis
 """Settings that stand in another command alone."""
 _FLAGS = {"--cfg", "-c", "--resolve", "--multirun", "-m"}
 _SWEEP_FLAGS = {"--multirun", "-m"}
-_PATHS = {"run_dir", "checkpoint", "out", "video", "save"}
 _FILES = ("video", "csv")
 _OUTPUTS = ("run_dir", "out", "save", *_FILES)
+_PATHS = {"checkpoint", *_OUTPUTS}
 _ALL = "--help lists all."
 
 

@@ -34,7 +34,7 @@ class EvaluateConfig(PlannerCommandConfig):
     """What to evaluate."""
 
     episodes: int = 10
-    """How many are played, side by side unless there is a film."""
+    """How many are played, side by side; a film is of the first."""
     policy: Literal["planner", "bare"] = "planner"
     """``bare`` is the policy network without the planner."""
     video: str | None = None

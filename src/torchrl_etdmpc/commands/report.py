@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from torchrl_etdmpc.commands.command_line import one_line_errors
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.files import make_folder
 
@@ -178,13 +179,12 @@ def choose_budget(
         (budget,) = planned
     else:
         budget = min(reached, benchmark.budget)
-    if arguments.grid_step:
-        if budget // arguments.grid_step > MOST_POINTS:
-            raise ValueError(
-                f"--grid-step={arguments.grid_step} makes more than {MOST_POINTS:,} points of {budget:,} env steps; "
-                f"take {-(-budget // MOST_POINTS):,} or more."
-            )
-        return budget, arguments.grid_step
+    step = arguments.grid_step or step
+    if step and budget // step > MOST_POINTS:
+        raise ValueError(
+            f"--grid-step={step} makes more than {MOST_POINTS:,} points of {budget:,} env steps; take "
+            f"{-(-budget // MOST_POINTS):,} or more."
+        )
     if step is None:
         first = begins(runs).max()
         steps = [budget // points for points in (10, 5, 4, 3, 2) if budget % points == 0]
@@ -413,28 +413,26 @@ def stamp(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
     return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 
 
+@one_line_errors
 def main() -> None:
     """Writes the report, once or again and again."""
-    try:
-        arguments = parse()
-        from torchrl_etdmpc.analysis import read_curves, read_points
+    arguments = parse()
+    from torchrl_etdmpc.analysis import read_curves, read_points
 
-        references = [read_curves(file) for file in arguments.reference]
-        points = [read_points(file) for file in arguments.points]
-        if arguments.watch is None:
-            print(report(arguments, references, points))
-            return
-        seen = None
-        while True:
-            try:
-                now = stamp(arguments)
-                if now != seen:
-                    print(report(arguments, references, points), flush=True)
-                    seen = now
-            except (ValueError, OSError) as error:  # a run that is just being made is complete the next time
-                print(f"waiting: {error}", file=sys.stderr, flush=True)
-            time.sleep(arguments.watch)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (ValueError, OSError, ImportError) as error:
-        sys.exit(f"error: {error}")
+    references = [read_curves(file) for file in arguments.reference]
+    points = [read_points(file) for file in arguments.points]
+    if arguments.watch is None:
+        print(report(arguments, references, points))
+        return
+    seen = None
+    while True:
+        try:
+            now = stamp(arguments)
+            if now != seen:
+                print(report(arguments, references, points), flush=True)
+                seen = now
+        except BrokenPipeError:
+            raise
+        except (ValueError, OSError) as error:  # a run that is just being made is complete the next time
+            print(f"waiting: {error}", file=sys.stderr, flush=True)
+        time.sleep(arguments.watch)

@@ -104,7 +104,7 @@ def help_text(
         values (dict, optional): defaults by name, where a preset says otherwise than the class.
     """
     settings, groups = settings_of(config_class), groups_of(config_class)
-    width = min(shutil.get_terminal_size().columns, 100)
+    width = max(min(shutil.get_terminal_size().columns, 100), _NAME_WIDTH + 23)
     lines: list[str] = []
     for topic in topics:
         chosen = [name for name in settings if name == topic or name.startswith(f"{topic}.")]

@@ -72,7 +72,7 @@ class RecordedGymnasiumEnv(RecordedEnv, GymWrapper):
     def _fingerprint(self) -> np.ndarray:
         data = getattr(self._env.unwrapped, "data", None)
         if all(hasattr(data, name) for name in ("qpos", "qvel", "time")):  # MuJoCo
-            # And what wrappers have made of them, by random numbers of their own, or remember.
+            # And goals, and what wrappers have made of all this, by random numbers of their own, or remember.
             return np.concatenate([data.qpos, data.qvel, [data.time], np.ravel(self._observation)])
         return self._observation
 

@@ -89,9 +89,6 @@ class RecordedHumanoidBenchEnv(RecordedGymnasiumEnv):
         super()._set_random_state(state[:_PCG64])
         self._numbers = unpack_mt19937(state[_PCG64:])
 
-    def _fingerprint(self) -> np.ndarray:
-        return np.concatenate([super()._fingerprint(), self._observation])  # goals are in no joint
-
 
 def _numpy_state() -> Any:
     return np.random.get_state()  # of the MT19937 that it always is, a tuple; its type has a dictionary as well

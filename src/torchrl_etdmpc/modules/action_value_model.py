@@ -23,7 +23,7 @@ class ActionValueWorldModel(WorldModel):
     :class:`~torchrl_etdmpc.modules.ActionValueModel`, it is planned over as TD-MPC2 does.
 
     Args:
-        observation_dim (int): O, size of the flat observation.
+        observation_dim (int, optional): O, size of the flat observation; ``None`` with an encoder of one's own.
         action_dim (int): A.
         mlp_dim (int): hidden size of dynamics, reward, value, policy and termination.
         num_dynamics (int): F, dynamics heads. Default: 1.
@@ -47,7 +47,7 @@ class ActionValueWorldModel(WorldModel):
 
     def __init__(
         self,
-        observation_dim: int,
+        observation_dim: int | None,
         action_dim: int,
         *,
         mlp_dim: int = 512,

@@ -12,10 +12,10 @@ def draw_new_weights(network: nn.Module) -> None:
 
     Args:
         network (nn.Module): one with ``reset_parameters_recursive`` does it itself; of any other every layer with
-            parameters has ``reset_parameters``, as PyTorch's have.
+            parameters has ``reset_parameters``, as PyTorch's have (its attention: ``_reset_parameters``).
 
     Raises:
-        TypeError: if a layer with parameters of its own has no ``reset_parameters``.
+        TypeError: if a layer with parameters of its own has neither.
 
     >>> draw_new_weights(nn.Sequential(nn.Linear(3, 2), nn.ReLU()))
     """
@@ -23,13 +23,19 @@ def draw_new_weights(network: nn.Module) -> None:
     if own is not None:
         own()
         return
-    layers: list[Any] = list(network.modules())
+    layers = list(network.modules())
     for layer in layers:
-        if next(layer.parameters(recurse=False), None) is not None and not hasattr(layer, "reset_parameters"):
+        if next(layer.parameters(recurse=False), None) is not None and _reset_of(layer) is None:
             raise TypeError(
                 f"new weights need reset_parameters() in every layer with parameters, got {type(layer).__name__} "
-                "without; add the method."
+                "without; add the method, or give the network reset_parameters_recursive()."
             )
-    for layer in layers:
-        if hasattr(layer, "reset_parameters"):
-            layer.reset_parameters()
+    for layer in reversed(layers):  # as they were made: a layer after those that it holds
+        reset = _reset_of(layer)
+        if reset is not None:
+            reset()
+
+
+def _reset_of(layer: nn.Module) -> Any:
+    """How a layer draws its weights."""
+    return getattr(layer, "reset_parameters", None) or getattr(layer, "_reset_parameters", None)

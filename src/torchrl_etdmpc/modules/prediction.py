@@ -126,7 +126,7 @@ def has_policy(model: object) -> TypeGuard[PolicyModel]:
     >>> has_policy(torch.nn.Linear(2, 2))
     False
     """
-    return any(getattr(model, name, None) is not None for name in _POLICY)
+    return getattr(model, "policy", None) is not None  # an activation is often called act
 
 
 def has_action_values(model: object) -> TypeGuard[ActionValueModel]:

@@ -282,10 +282,10 @@ class LatentRolloutLoss(SharedNetworksLoss):
 
         Raises:
             ValueError: if the batch is empty, an entry is not of shape [B, T, features] (one that the encoder owns:
-                [B, T, ...]), or of another size or dtype than the networks need, or steps of a slice do not follow each
-                other; without ``ignore_termination`` also if a row terminates although the world model has no
-                termination head. The last two look at values: they are made on a CPU only, where they do not wait for
-                the device, and not under ``torch.compile``.
+                [B, T, ...]), or of another size or dtype than the networks need, a next observation is not finite, or
+                steps of a slice do not follow each other; without ``ignore_termination`` also if a row terminates
+                although the world model has no termination head. What depends on values, the last three, is checked on
+                a CPU alone, where it does not wait for the device, and not under ``torch.compile``.
             KeyError: if a key is missing.
             RuntimeError: if the world model's weights are no longer those that this loss trains, or its targets are
                 elsewhere.

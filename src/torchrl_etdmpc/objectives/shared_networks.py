@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
@@ -139,12 +140,15 @@ class SharedNetworksLoss(LossModule):
         super()._save_to_state_dict(destination, prefix, keep_vars)
         # The world model is not a submodule, but who restores the weights restores the number of updates in them.
         destination[f"{prefix}version"] = self.world_model.version.detach()
+        if not {"reward", "value"}.isdisjoint(self._shared()):  # whose weights mean nothing without them
+            destination[f"{prefix}bins"] = self.world_model.bins.detach()
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._refuse_other_networks({k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)})
-        version = state_dict.get(f"{prefix}version")
-        super()._load_from_state_dict({k: v for k, v in state_dict.items() if k != f"{prefix}version"}, prefix, *args)
-        if version is not None:  # files of before do not have it
+        others = (f"{prefix}version", f"{prefix}bins")  # files of before lack them
+        super()._load_from_state_dict({k: v for k, v in state_dict.items() if k not in others}, prefix, *args)
+        version = state_dict.get(others[0])
+        if version is not None:
             self.world_model.version.copy_(version)
             restart_count(self.world_model)
 
@@ -164,6 +168,12 @@ class SharedNetworksLoss(LossModule):
             if name not in given or given[name].shape != value.shape
         ]
         faults += [f"it has {name}" for name in given if name not in own]
+        bins = self.world_model.bins
+        if "bins" in state and not bins.is_meta:  # files of before lack them
+            there, here = state["bins"][[0, -1]].tolist(), bins[[0, -1]].tolist()
+            # Those of a state in half precision are rounded to within 2^-8.
+            if not all(math.isclose(*ends, rel_tol=2**-8) for ends in zip(there, here, strict=True)):
+                faults.append(f"its bins reach from {there[0]:g} to {there[1]:g}, here from {here[0]:g} to {here[1]:g}")
         if faults:
             more = f", and {len(faults) - 1} more" if faults[1:] else ""
             raise RuntimeError(f"the state is of another world model: {faults[0]}{more}; build this one like that one.")

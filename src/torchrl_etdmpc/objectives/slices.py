@@ -167,10 +167,11 @@ class SliceReader:
                 f"{self.owner} needs continuous actions in [-1, 1], got {key!r} of {value.dtype}; discrete "
                 "actions have no Gaussian policy."
             )
-        if name in ("action", *OBSERVATION_FIELDS) and value.dtype == torch.float64 != model.bins.dtype:
+        dtype = model.bins.dtype
+        if name in ("action", *OBSERVATION_FIELDS) and torch.promote_types(value.dtype, dtype) != dtype:
             raise ValueError(
                 f"{self.owner} needs {key!r} in {model.bins.dtype}, as the weights are, got {value.dtype}; "
-                "append DoubleToFloat() to the environment, or convert the batch."
+                "convert the batch, or append a transform to the environment: of float64 DoubleToFloat()."
             )
 
     def _shape_error(self, key: NestedKey, value: Tensor | TensorDictBase) -> ValueError:
@@ -204,7 +205,7 @@ class SliceReader:
         if terminated is None or terminated.device.type != "cpu":
             return
         if counts is not None:
-            terminated = terminated.squeeze(-1).bool() & counts
+            terminated = terminated.reshape(counts.shape).bool() & counts
         if terminated.any():
             raise ValueError(
                 f"{self.terminated_key!r} holds True, but the world model has no termination head, so values would "

@@ -78,7 +78,7 @@ class Term:
         """Error ``[T, B]`` and metrics.
 
         Raises:
-            ValueError: if the shape of the error, or the names or kinds of the metrics are others than stated.
+            ValueError: if the shapes of error or metrics, or the metrics' names or kinds are others than stated.
         """
         result = self.function(world_model, slices, rollout)
         error, metrics = result if isinstance(result, tuple) else (result, {})
@@ -88,6 +88,11 @@ class Term:
                 raise ValueError(
                     f"the metric {name!r} of the term {self.name!r} must be a floating point tensor, got {kind}; "
                     "convert it, e.g. with .float()."
+                )
+            if metric.ndim and metric.shape != slices.action.shape[:2]:
+                raise ValueError(
+                    f"the metric {name!r} of the term {self.name!r} must be of shape [T, B]="
+                    f"{list(slices.action.shape[:2])} or a scalar, got {list(metric.shape)}; average over what is more."
                 )
         if error.shape != slices.action.shape[:2]:
             raise ValueError(

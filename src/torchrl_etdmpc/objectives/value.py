@@ -209,11 +209,18 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
         ignore_termination: bool = False,
         reduction: Reduction | None = None,
     ) -> None:
-        options: Any = {"value_coef": value_coef, "value_beta": value_beta, "value_replayed": value_replayed}
-        options["value_expectile"] = value_expectile
+        term = value_term(
+            self,
+            world_model,
+            value_coef=value_coef,
+            value_beta=value_beta,
+            value_replayed=value_replayed,
+            value_expectile=value_expectile,
+            discount=discount,
+        )
         super().__init__(
             world_model,
-            [value_term(self, world_model, discount=discount, **options)],
+            [term],
             rho=rho,
             reduction=reduction,
             ignore_termination=ignore_termination,

@@ -68,6 +68,16 @@ class BarePolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the mean action."""
-        mean, _ = self.world_model.policy(self.world_model.encode(tensordict.get(self.in_keys[0])))
+        """Writes the mean action.
+
+        Raises:
+            KeyError: if there is no observation.
+        """
+        observation = tensordict.get(self.in_keys[0], None)
+        if observation is None:
+            raise KeyError(
+                f"the policy needs {self.in_keys[0]!r} in its input; pass observation_key=... if your environment "
+                "names it otherwise."
+            )
+        mean, _ = self.world_model.policy(self.world_model.encode(observation))
         return tensordict.set(self.out_keys[0], mean)

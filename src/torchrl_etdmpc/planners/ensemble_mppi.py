@@ -250,7 +250,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         action, one = torch.Size([self.world_model.action_dim]), torch.Size([1])
         like = {"device": device, "dtype": dtype}
         specs = {
-            self._written[0]: self.action_spec,
+            self.action_key: self.action_spec,
             self.plan_keys[LOC]: Unbounded(action, **like),
             self.plan_keys[SCALE]: Unbounded(action, **like),
             self.plan_keys[VALUE]: Unbounded(one, **like),
@@ -312,13 +312,13 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         """
         device, dtype = self.env.device_and_dtype()
         spec = Unbounded(torch.Size([self.horizon, self.world_model.action_dim]), device=device, dtype=dtype)
-        keys = {"observation_key": self.observation_key, "action_key": self._written[0]}
-        fits = {"spaces": model_sizes(self.world_model) | keys, "latent_key": self.latent_key}
+        keys = {"observation_key": self.observation_key, "action_key": self.action_key}
+        fits = {"spaces": model_sizes(self.world_model) | {"dtype": dtype} | keys, "latent_key": self.latent_key}
         return PlanPrimer({self.plan_mean_key: spec}, default_value=0.0, expand_specs=True, **fits)
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """Plans and returns the action alone (the interface of TorchRL's planners)."""
-        return self(td.copy()).get(self._written[0])
+        return self(td.copy()).get(self.action_key)
 
     @torch.no_grad()
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]  # the base class takes kwargs only to refuse them
@@ -373,7 +373,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             drawn["noise"] = self.draw_noise(*batch, generator=generator)
         plan = make_plan(observation, carried, latent=latent, explore=explore, **drawn)
         outputs = {
-            self._written[0]: plan.action,
+            self.action_key: plan.action,
             self.plan_keys[LOC]: plan.loc,
             self.plan_keys[SCALE]: plan.scale,
             self.plan_keys[VALUE]: plan.value.unsqueeze(-1),

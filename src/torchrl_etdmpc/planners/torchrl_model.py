@@ -105,9 +105,12 @@ class TorchRLModel(nn.Module):
         steps = self.model
         if isinstance(steps, ModelBasedEnvBase):
             if type(steps)._step is not ModelBasedEnvBase._step:
-                return
+                specs = steps.full_observation_spec, steps.full_state_spec, steps.full_reward_spec
+                return self._require_names([key for spec in specs for key in spec.keys(True, True)])
             steps = steps.world_model
-        written = [unravel_key(key) for key in steps.out_keys]
+        self._require_names([unravel_key(key) for key in steps.out_keys])
+
+    def _require_names(self, written: list[NestedKey]) -> None:
         for key in (*self.state_sizes, self.reward_key):
             if key not in written and unravel_key((NEXT, key)) not in written:
                 raise ValueError(

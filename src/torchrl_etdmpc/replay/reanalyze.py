@@ -207,7 +207,7 @@ class ReanalyzeTransform(Transform):
 
         Raises:
             RuntimeError: if the transform is not attached to a buffer, or a later one changes the observation.
-            KeyError: if the sample lacks the targets or the index.
+            KeyError: if the sample lacks the observation, the targets or the index.
         """
         if tensordict.batch_dims > 1:
             return self.refresh(tensordict.reshape(-1)).reshape(tensordict.batch_size)
@@ -216,6 +216,11 @@ class ReanalyzeTransform(Transform):
             raise RuntimeError("ReanalyzeTransform has no buffer to write to; use reanalyze.attach(replay_buffer).")
         self._check_order(buffer)
         index = tensordict.get("index", None)
+        if tensordict.get(self.observation_key, None) is None:
+            raise KeyError(
+                f"reanalyze needs the observation {self.observation_key!r} in the sample; store it, or name it by "
+                "observation_key=."
+            )
         missing = [key for key in self.plan_keys.values() if tensordict.get(key, None) is None]
         if index is None or missing:
             raise KeyError(

@@ -55,7 +55,8 @@ def _format_warning(message: Any, category: Any, filename: str, lineno: int, lin
 
 def _write(line: str, stream: TextIO) -> None:
     if stream.isatty():  # which would break words
-        line = "\n         ".join(textwrap.wrap(line, shutil.get_terminal_size().columns - 9, break_long_words=False))
+        width = max(shutil.get_terminal_size().columns - 9, 20)
+        line = "\n         ".join(textwrap.wrap(line, width, break_long_words=False))
     try:
         from tqdm import tqdm
     except ImportError:

@@ -211,6 +211,12 @@ class RunDirectory:
             shutil.rmtree(folder, ignore_errors=True)
         self.config.unlink(missing_ok=True)  # last: without it the rest is not a leftover
 
+    def _remove_partial_files(self) -> None:
+        """Of the run's own files; others may be writing theirs, e.g. a film, beside them."""
+        for file in (self.config, self.train, self.eval, self.summary, self.curve, self.wandb_id):
+            for left in self.path.glob(f".{file.stem}.*.partial{file.suffix}"):
+                left.unlink(missing_ok=True)
+
     def _remove_folders(self) -> None:
         for folder in reversed(self._made):
             with contextlib.suppress(OSError):  # something else is in it now
@@ -271,6 +277,7 @@ class RunDirectory:
                 return
             if os.fstat(descriptor).st_nlink:
                 self._unlock = weakref.finalize(self, _unlock, self.lock, descriptor)
+                self._remove_partial_files()
             else:  # its owner has unlocked and removed it since it was opened
                 os.close(descriptor)
 

@@ -19,6 +19,15 @@ def processor() -> str:
     return f"{platform.machine()} ({names[0]})" if names else platform.machine()
 
 
+def usable_cores() -> int:
+    """The cores that this process may use.
+
+    >>> usable_cores() >= 1
+    True
+    """
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def machine_memory() -> int | None:
     """Bytes of memory, ``None`` where the system does not tell.
 

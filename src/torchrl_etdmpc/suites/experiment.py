@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
+import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,7 +121,10 @@ class Search:
     def is_whole(self, name: str) -> bool:
         """Whether a range holds whole numbers: that of a setting that is one, or between two of them."""
         low, high = self.space[name]["low"], self.space[name]["high"]
-        counted = type(flat(preset("cpu").to_dict()).get(name.removeprefix("task."))) is int
+        group, _, last = name.removeprefix("task.").rpartition(".")
+        hints = typing.get_type_hints(TrainConfig)
+        hint = (typing.get_type_hints(hints[group]) if group in hints else hints).get(last)
+        counted = int in (hint, *typing.get_args(hint))
         return type(low) is type(high) is int or (counted and float(low).is_integer() and float(high).is_integer())
 
     def points(self) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrl_etdmpc.runs import RunDirectory
+from torchrl_etdmpc.runs import RunDirectory, usable_cores
 from torchrl_etdmpc.suites.attempt import start
 from torchrl_etdmpc.suites.experiment import Run
 from torchrl_etdmpc.suites.run_queue import RunQueue
@@ -87,11 +87,6 @@ def run_locally(queue: RunQueue, *, workers: int | None = None, per_gpu: int = 1
     return not stop.requested
 
 
-def usable_cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def visible_gpus() -> list[str]:
     """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` calls them."""
     count = torch.cuda.device_count()
@@ -112,7 +107,7 @@ def _look_at(place: _Place, queue: RunQueue, threads: int) -> None:
         return
     begins = not RunDirectory(run.path).holds_a_run
     try:
-        gpu = place.gpu if run.config.device != "cpu" else None
+        gpu = place.gpu if run.config.device in ("auto", "cuda") else None  # cuda:N counts those of this machine
         place.process, place.run, place.told = start(run, threads=threads, gpu=gpu), run, False
         queue.say(f"{run.name}: {'begins' if begins else 'goes on'}")
     except OSError as error:

@@ -7,10 +7,9 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from torchrl_etdmpc.runs import first_line
+from torchrl_etdmpc.runs import first_line, usable_cores
 from torchrl_etdmpc.suites.attempt import start
 from torchrl_etdmpc.suites.experiment import Run
-from torchrl_etdmpc.suites.local import usable_cores
 from torchrl_etdmpc.suites.run_queue import RunQueue
 from torchrl_etdmpc.training.ray_cluster import RayCluster
 from torchrl_etdmpc.training.signals import StopSignals

@@ -194,8 +194,11 @@ class Sweep:
         trial = optuna.trial.Trial(self._study, frozen._trial_id)
         curves = [_evaluations(run) for run in runs]
         reached = set(curves[0]).intersection(*curves[1:]) - set(frozen.intermediate_values)
-        for step in sorted(reached):
-            trial.report(fmean(curve[step] for curve in curves), step)
+        try:
+            for step in sorted(reached):
+                trial.report(fmean(curve[step] for curve in curves), step)
+        except optuna.exceptions.UpdateFinishedTrialError:  # by another process that looks for the same
+            return None
         return trial if reached else None
 
 

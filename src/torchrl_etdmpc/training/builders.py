@@ -34,7 +34,7 @@ def resolve_device(name: str) -> torch.device:
     A CUDA device becomes PyTorch's current one, and products on it may use TF32, as in training.
 
     Raises:
-        ValueError: if it is none of these, or CUDA is asked for and not there.
+        ValueError: if it is none of these, or CUDA is asked for and not there, or not that device.
 
     >>> resolve_device("cpu")
     device(type='cpu')
@@ -46,6 +46,11 @@ def resolve_device(name: str) -> torch.device:
         if not there:
             raise ValueError(
                 f"device={name} needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."
+            )
+        count = torch.cuda.device_count()
+        if device.index is not None and device.index >= count:
+            raise ValueError(
+                f"device={name} is not there: this PyTorch sees {count} CUDA device{'s' * (count > 1)}, counted from 0."
             )
         if device.index is not None:  # a copy to the CPU waits for the current device alone, inside of TensorDict
             torch.cuda.set_device(device)

@@ -37,8 +37,8 @@ def follow_own_code(name: str, value: str) -> None:
     """
     if name == "score" and value in typing.get_args(ScoreName):
         raise ValueError(
-            f"score must be the path of the code that the agent was trained with, got {value!r}; say "
-            f"planner.score={value} to plan with another score."
+            f"score must be the path of the code that the agent was trained with, got {value!r}; leave it out. With "
+            f"evaluate and inspect_planner, planner.score={value} plans with another score."
         )
     if name in OWN_CODE and (":" in value or (not name.endswith(".score") and value != "null")):
         _followed[OWN_CODE[name], value] = import_attribute(value, name)

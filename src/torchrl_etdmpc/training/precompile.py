@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import pickle
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from torchrl import torchrl_logger
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_etdmpc.runs import first_line, progress_bar
+from torchrl_etdmpc.runs import first_line, progress_bar, usable_cores
 from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 
@@ -46,7 +45,7 @@ def precompile(config: TrainConfig, agent: Agent, batch: Sequence[int], eval_bat
     parts = _parts(config, agent, batch, eval_batch)
     calls = 1 if agent.compile_mode == "default" else 3  # CUDA graphs are recorded after a first run
     several = device.type == "cuda" or torch.get_num_threads() > 1
-    processes = min(os.cpu_count() or 1, len(parts)) if several else 1
+    processes = min(usable_cores(), len(parts)) if several else 1
     own, *others = ([*parts][first::processes] for first in range(processes))
     try:
         with contextlib.ExitStack() as stack:

@@ -46,7 +46,7 @@ class RunCheckpoints:
     Args:
         config (TrainConfig): how often, how many, and what may be gone on with.
         directory (RunDirectory): of the run.
-        learner (Learner): has the buffer, the version of the weights and the counts.
+        learner (Learner): has the buffer and the counts.
         best (BestAgent): its file is written here if the disk did not take it before.
         parts (mapping): what is saved and restored, in this order.
     """
@@ -106,8 +106,7 @@ class RunCheckpoints:
         self._saved_at = time.perf_counter()
         self.best.write()
         learner = self.learner
-        version = int(learner.agent.world_model.version)
-        self.store.save(learner.env_steps, self.parts, learner.replay, version=version, links=self._links)
+        self.store.save(learner.env_steps, self.parts, learner.replay, links=self._links)
         self._saved_step = learner.env_steps
 
     def restore(self) -> None:
