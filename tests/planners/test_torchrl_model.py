@@ -175,23 +175,27 @@ def test_a_state_that_the_model_only_reads_is_refused(make_imagined):
 
 
 class Stepped(Imagined):
-    """Steps by itself, so that its specs alone say what it writes."""
+    """Steps by itself, and writes less or more than its specs say."""
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def __init__(self, *left_out: str) -> None:
+        super().__init__()
+        self.left_out = left_out
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         place = tensordict["place"] + 0.5 * tensordict["action"]
-        written = {"place": place, ("hidden", "mark"): tensordict["hidden", "mark"], "reward": rewarded(place)}
+        written = {"place": place, ("hidden", "mark"): place * 0, "reward": rewarded(place), "speed": place}
         done = torch.zeros_like(place, dtype=torch.bool)
-        return TensorDict(written | {"done": done, "terminated": done}, tensordict.batch_size)
+        return TensorDict(written | {"done": done, "terminated": done}, tensordict.batch_size).exclude(*self.left_out)
 
 
-def test_a_wrong_name_in_an_environment_with_a_step_of_its_own_is_refused():
+def test_what_an_environment_with_a_step_of_its_own_writes_is_seen_at_its_first():
     sizes = {"place": 1, ("hidden", "mark"): 1}
-    TorchRLModel(Stepped(), action_dim=1, state_sizes=sizes)
-    for options in ({"state_sizes": {"y": 1}}, {"state_sizes": sizes, "reward_key": "cost"}):
-        with pytest.raises(
-            ValueError, match=r"^the model does not write '(y|cost)', at .*; it writes \['place', .*'reward'"
-        ):
-            TorchRLModel(Stepped(), action_dim=1, **options)
+    TorchRLModel(Stepped(), action_dim=1, state_sizes=sizes | {"speed": 1})
+    message = r"^the model does not write '{}', at the root or below 'next'; it writes \[.*'hidden', 'mark'"
+    with pytest.raises(ValueError, match=message.format("cost")):
+        TorchRLModel(Stepped(), action_dim=1, state_sizes=sizes, reward_key="cost")
+    with pytest.raises(ValueError, match=message.format("place")):  # that of before would stay
+        TorchRLModel(Stepped("place"), action_dim=1, state_sizes=sizes)
 
 
 def prior(*out_keys: str) -> WorldModelWrapper:

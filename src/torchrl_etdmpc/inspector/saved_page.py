@@ -189,9 +189,7 @@ def _side(trace: Trace) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for name in figures.FIGURES:
         draw = figures.plain(getattr(figures, name))
-        if name == "return_table":
-            made[name] = _plain(draw(trace))
-        elif name in MOVING:
+        if name in MOVING and name != "return_table":
             made[name] = [_plain(draw(trace, iteration)) for iteration in range(trace.iterations)]
         else:
             made[name] = _plain(draw(trace))

@@ -105,18 +105,12 @@ class TorchRLModel(nn.Module):
         steps = self.model
         if isinstance(steps, ModelBasedEnvBase):
             if type(steps)._step is not ModelBasedEnvBase._step:
-                specs = steps.full_observation_spec, steps.full_state_spec, steps.full_reward_spec
-                return self._require_names([key for spec in specs for key in spec.keys(True, True)])
+                return  # its first step tells
             steps = steps.world_model
-        self._require_names([unravel_key(key) for key in steps.out_keys])
-
-    def _require_names(self, written: list[NestedKey]) -> None:
+        written = [unravel_key(key) for key in steps.out_keys]
         for key in (*self.state_sizes, self.reward_key):
             if key not in written and unravel_key((NEXT, key)) not in written:
-                raise ValueError(
-                    f"the model does not write {key!r}, at the root or below 'next'; it writes {written}. Name what it "
-                    "writes in state_sizes and reward_key, or let it write a state that never changes as well."
-                )
+                raise _not_written(key, written)
 
     def _refuse_draws(self) -> None:
         device, dtype = device_and_dtype(self)
@@ -187,12 +181,22 @@ class TorchRLModel(nn.Module):
         before.set(self.action_key, action.expand(*batch, self.action_dim).reshape(-1, self.action_dim))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             if isinstance(self.model, ModelBasedEnvBase):
-                after = self.model.step(before)
+                after: TensorDictBase = self.model.step(before).get(NEXT)  # at the root are the states before
             else:
                 after = self.model(before)
         below: TensorDictBase = after.get(NEXT, after)
         found = {}
         for key in (*self.state_sizes, self.reward_key):
             value = below.get(key, None)
-            found[key] = after.get(key) if value is None else value
+            value = after.get(key, None) if value is None else value
+            if value is None:
+                raise _not_written(key, list(below.keys(True, True)))
+            found[key] = value
         return TensorDict(found, after.batch_size, device=after.device).reshape(batch)
+
+
+def _not_written(key: NestedKey, written: list[NestedKey]) -> ValueError:
+    return ValueError(
+        f"the model does not write {key!r}, at the root or below 'next'; it writes {written}. Name what it writes in "
+        "state_sizes and reward_key, or let it write a state that never changes as well."
+    )
