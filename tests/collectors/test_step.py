@@ -924,7 +924,7 @@ def test_a_non_finite_value_is_named_with_its_step_and_not_stored(broken, source
 def test_a_policy_that_writes_no_action_is_answered_with_what_it_wrote():
     policy = TensorDictModule(lambda observation: observation, in_keys=["observation"], out_keys=["torque"])
     collector = StepCollector(LineEnv(4), policy, replay_buffer=make_replay())
-    with pytest.raises(KeyError, match=r"the policy wrote no 'action'; it wrote \[.*'torque'"):
+    with pytest.raises(KeyError, match=r"the policy wrote no .*action.*; it wrote .*torque"):
         collector.step()
 
 

@@ -80,7 +80,7 @@ def test_every_episode_has_its_line_in_a_table(tmp_path, monkeypatch, checkpoint
         f"checkpoint={checkpoint}", "episodes=3", "policy=bare", "seed=5", "device=cpu", "csv=~/tables/a.csv"
     )
     assert (message, err) == (None, "")
-    assert out.endswith(" over 3 episodes; episodes in ~/tables/a.csv\n")
+    assert out.endswith(f" over 3 episodes; episodes in {tmp_path}/tables/a.csv\n")
     assert [path.name for path in tmp_path.iterdir()] == ["tables"]
     agent, _, _ = load_agent(checkpoint)
     env = make_env("cartpole-balance", seed=5, num_envs=3, parallel=False)

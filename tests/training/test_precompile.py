@@ -105,7 +105,7 @@ def reads_the_value(world_model):
 
 def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, agent):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: 8)
     assert run(tiny_config, agent) > 0
     assert watched == ["a", "b", "c", "d"]
 
@@ -113,7 +113,6 @@ def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, a
 @pytest.mark.parametrize(
     ("cores", "asked", "own"),
     [
-        (None, [], "abcd"),
         (1, [], "abcd"),
         (2, ["bd"], "ac"),
         (3, ["b", "c"], "ad"),
@@ -123,7 +122,7 @@ def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, a
 )
 def test_with_several_threads_the_cores_share_the_parts(monkeypatch, watched, tiny_config, agent, cores, asked, own):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: cores)
     run(tiny_config, agent)
     asks, waits, ends = [("asks for", [*names]) for names in asked], ["waits"] * len(asked), ["ends"] * len(asked)
     assert watched == [*asks, *own, *waits, *"".join(asked), *ends]
@@ -131,7 +130,7 @@ def test_with_several_threads_the_cores_share_the_parts(monkeypatch, watched, ti
 
 def test_beside_a_gpu_the_cores_share_the_parts_whatever_the_threads(monkeypatch, watched, tiny_config, agent):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: 2)
     monkeypatch.setattr(type(agent), "device", torch.device("cuda:1"))
     monkeypatch.setattr(torch.random, "fork_rng", lambda devices: contextlib.nullcontext())
     run(tiny_config, agent)
@@ -141,7 +140,7 @@ def test_beside_a_gpu_the_cores_share_the_parts_whatever_the_threads(monkeypatch
 
 def test_nobody_waits_for_helpers_where_the_cache_has_everything(monkeypatch, watched, tiny_config, agent):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(precompile, "usable_cores", lambda: 2)
     monkeypatch.setattr(precompile, "_graphs_not_in_the_cache", lambda: 7)
     run(tiny_config, agent)
     assert watched == [("asks for", ["b", "d"]), "a", "c", "b", "d", "ends"]
