@@ -331,7 +331,7 @@ def _rows(stored: TensorDictBase, index: Tensor | slice) -> TensorDictBase:
 def _fingerprints(targets: TensorDictBase) -> Tensor:
     """One int64 for the bits of every row: their sum with odd weights, modulo 2^64.
 
-    Two rows that differ in one number have different ones, others but for one chance in some 2^64.
+    Of rows that differ in one number they always differ; in several, but for one chance in 2^32 or less.
     """
     draws = torch.Generator().manual_seed(0)
     total = torch.zeros(len(targets), dtype=torch.int64, device=targets.device)
