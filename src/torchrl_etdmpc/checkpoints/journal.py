@@ -102,11 +102,12 @@ class ReplayJournal:
                 entry = self._write(f"rows-{start:012d}", _rows(stored.exclude("index", *targets), position))
                 new["rows"] = [*new["rows"], entry | {"begin": start, "end": end}]
             if targets:
-                fingerprints = _fingerprints(stored.select(*targets))
+                targets_now = stored.select(*targets)
+                fingerprints = _fingerprints(targets_now)
                 changed = torch.ones_like(fingerprints, dtype=torch.bool)
                 before = saved.fingerprints.to(changed.device)
                 changed[: len(before)] = fingerprints[: len(before)] != before
-                new["targets"] = self._save_targets(stored.select(*targets), changed, old, written, capacity)
+                new["targets"] = self._save_targets(targets_now, changed, old, written, capacity)
         # Last: a failed save must leave the journal where it was, or those rows are never written.
         self.saved = _Saved(new, self._last_row(buffer, written), fingerprints)
         return new
