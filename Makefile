@@ -66,10 +66,12 @@ report: $(READY)
 	@$(VENV)/bin/python examples/report.py "$(RUN_DIR)" --out "$(RUN_DIR)/report" $(ARGS)
 
 # In the order of their names: the files with few tests, which would otherwise come last, take longest.
+# A test that hangs for ten minutes ends its process with a traceback; a second one ends all.
+test: HANGS := -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true --max-worker-restart=1
 test: export MUJOCO_GL ?= disable
 test: export OMP_NUM_THREADS ?= 1
 test: $(READY)
-	@$(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	@$(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(HANGS) $(ARGS)
 
 lint: export PYRIGHT_PYTHON_IGNORE_WARNINGS ?= 1# it would ask the network for newer versions of itself
 lint: $(READY)
