@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import functional_call
 
-from torchrl_etdmpc.functional import two_hot_cross_entropy, two_hot_decode
+from torchrl_etdmpc.functional import two_hot_cross_entropy
 from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss
 from torchrl_etdmpc.objectives.slices import Slices
-from torchrl_etdmpc.objectives.terms import PRIORITY, Term, require_not_negative
+from torchrl_etdmpc.objectives.terms import PRIORITY, Term, require_discount, require_not_negative
+from torchrl_etdmpc.objectives.value import target_heads
 
 
 def draw_two_heads(num_heads: int, device: torch.device) -> Tensor:
@@ -141,8 +141,7 @@ def action_value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value
             f"world_model must have action values, got {type(world_model).__name__}; build an ActionValueWorldModel."
         )
     require_not_negative(value_coef=value_coef)
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
+    require_discount(discount)
     return Term(
         "value",
         partial(_action_value, loss),
@@ -158,16 +157,10 @@ def action_value_term(loss: LatentRolloutLoss, world_model: WorldModel, *, value
 def _action_value(
     loss: LatentRolloutLoss, world_model: Any, slices: Slices, rollout: LatentRollout
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
     assert slices.reward is not None
-
-    def values(latent: Tensor, action: Tensor) -> Tensor:
-        logits = functional_call(loss._target_value, targets["value"], (latent, action))
-        return two_hot_decode(logits, world_model.bins).movedim(0, -1)
-
     target = action_value_target(
         world_model,
-        values,
+        target_heads(loss, world_model, rollout),
         rollout.encoded[1:],
         slices.reward,
         slices.terminated if world_model.termination_head is not None else None,  # a term of one's own may read it

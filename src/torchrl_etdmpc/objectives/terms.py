@@ -116,6 +116,12 @@ def require_not_negative(**coefs: float) -> None:
             raise ValueError(f"{name} must not be negative, got {coef}; 0 leaves the term out of the sum.")
 
 
+def require_discount(discount: float) -> None:
+    """Raises a ``ValueError`` where the discount is not in (0, 1]."""
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
+
+
 def check_terms(
     terms: Sequence[Term], extra_terms: Sequence[Term], *, networks: Collection[str], reserved: Collection[str]
 ) -> None:

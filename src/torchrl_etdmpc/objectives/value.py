@@ -21,7 +21,7 @@ from torchrl_etdmpc.modules import ActionValueWorldModel, WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
 from torchrl_etdmpc.objectives.slices import Slices
-from torchrl_etdmpc.objectives.terms import PRIORITY, Term, require_not_negative
+from torchrl_etdmpc.objectives.terms import PRIORITY, Term, require_discount, require_not_negative
 
 
 @torch.no_grad()
@@ -249,8 +249,7 @@ def value_term(
             "TDMPC2Loss."
         )
     require_not_negative(value_coef=value_coef)
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount must be in (0, 1], got {discount}; see discount_from_episode_length.")
+    require_discount(discount)
     if not 0 <= value_beta < math.inf:
         raise ValueError(f"value_beta must be finite and not negative, got {value_beta}; 0 is the mean of the heads.")
     if not 0 <= value_replayed <= 1:
@@ -272,18 +271,24 @@ def value_term(
     )
 
 
+def target_heads(loss: Any, world_model: WorldModel, rollout: LatentRollout) -> Callable[..., Tensor]:
+    """The target value heads of a loss that trains them: what the heads read, ``[..., *]``, to values ``[..., V]``."""
+    targets: Any = rollout.targets
+
+    def values(*read: Tensor) -> Tensor:
+        logits = functional_call(loss._target_value, targets["value"], read)
+        return two_hot_decode(logits, world_model.bins).movedim(0, -1)
+
+    return values
+
+
 def _value(
     loss: Any,
     world_model: WorldModel,
     slices: Slices,
     rollout: LatentRollout,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    targets: Any = rollout.targets  # a loss that trains the value heads has targets of them
-
-    def values(latent: Tensor) -> Tensor:
-        logits = functional_call(loss._target_value, targets["value"], (latent,))
-        return two_hot_decode(logits, world_model.bins).movedim(0, -1)
-
+    values = target_heads(loss, world_model, rollout)
     # The targets stand on the encoded latents, never on the rollout: the rollout's errors must not enter them.
     target = torch.zeros_like(rollout.encoded[:-1, :, 0])
     value_beta, value_replayed = loss.value_beta, loss.value_replayed

@@ -16,7 +16,7 @@ import yaml
 from torchrl_etdmpc.analysis import BENCHMARKS
 from torchrl_etdmpc.envs import DMC_TASKS, get_task
 from torchrl_etdmpc.runs import DamagedFileError, RunDirectory
-from torchrl_etdmpc.runs.dotted import flat
+from torchrl_etdmpc.runs.dotted import flat, put
 from torchrl_etdmpc.runs.files import read_whole, write_whole
 from torchrl_etdmpc.training import CHANGEABLE, TrainConfig, preset, read_run_config
 from torchrl_etdmpc.training.config import typed_name
@@ -228,7 +228,7 @@ class Experiment:
             values = preset(name).to_dict()
             settings.setdefault("total_env_steps", self._budget(task))
             for name, value in settings.items():
-                _put(values, name, value)
+                put(values, name.removeprefix("task."), value)
             return TrainConfig.from_dict({**values, "task": task, "seed": seed})
         except ValueError as error:
             raise ValueError(f"variant {variant!r} of experiment {self.name}: {error}") from error
@@ -551,14 +551,6 @@ def _folder(task: str) -> str:
     'gym_Pendulum-v1'
     """
     return re.sub(r"[/:\\]", "_", task)
-
-
-def _put(values: dict[str, Any], name: str, value: Any) -> None:
-    *groups, last = name.removeprefix("task.").split(".")
-    for group in groups:
-        values = values.setdefault(group, {})
-        _require(isinstance(values, dict), f"unknown setting {name}; {group} has none below it.")
-    values[last] = value
 
 
 def _require(condition: bool, message: str) -> None:

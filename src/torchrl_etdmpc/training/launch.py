@@ -19,7 +19,7 @@ from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.envs.seeding import seed_everything
 from torchrl_etdmpc.runs import RunDirectory, RunLog, make_logger, require_logger
-from torchrl_etdmpc.runs.dotted import flat
+from torchrl_etdmpc.runs.dotted import flat, nested
 from torchrl_etdmpc.training.agent_file import read_agent_file
 from torchrl_etdmpc.training.builders import resolve_device
 from torchrl_etdmpc.training.config import TrainConfig, typed_name
@@ -272,7 +272,7 @@ def with_stored_settings(
             return dict(values)
         told, wanted = flat(read_run_config(directory, kind).to_dict()), flat(values)
         told |= {name: wanted[name] for name in explicit if name in wanted}
-        return {**_nested(told), "run_dir": values.get("run_dir")}
+        return {**nested(told), "run_dir": values.get("run_dir")}
     stored = resumed_config(read_run_config(directory, kind), values, explicit).to_dict()
     return {**stored, "run_dir": values.get("run_dir")}
 
@@ -326,15 +326,4 @@ def resumed_config(saved: TrainConfig, asked: TrainConfig | Mapping[str, Any], e
                 f"{typed_name(name)}={wanted.get(name)} was asked for, but this run was started with "
                 f"{typed_name(name)}={values[name]}; leave it out to go on, or start a new run_dir."
             )
-    return type(saved).from_dict(_nested(values))
-
-
-def _nested(values: dict[str, Any]) -> dict[str, Any]:
-    nested: dict[str, Any] = {}
-    for name, value in values.items():
-        *groups, last = name.split(".")
-        target = nested
-        for group in groups:
-            target = target.setdefault(group, {})
-        target[last] = value
-    return nested
+    return type(saved).from_dict(nested(values))
