@@ -20,6 +20,7 @@ import cloudpickle
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl import torchrl_logger
 from torchrl.collectors import Collector
 from torchrl.envs import ActionScaling, Compose, EnvBase, GymEnv, RewardScaling, StepCounter, TransformedEnv
 
@@ -558,6 +559,34 @@ def test_a_signal_is_obeyed_while_the_workers_hang(tmp_path, monkeypatch, where,
     assert not answered
     goes_on.set()
     assert CheckpointStore(RunDirectory(run_dir).checkpoints).newest_step() == made
+
+
+def test_workers_that_send_nothing_are_told_of_again_and_again(monkeypatch):
+    goes_on, told = threading.Event(), []
+
+    def warning(text: str) -> None:
+        told.append(text)
+        if len(told) == 3:
+            goes_on.set()
+
+    class Hanging(Workers):
+        def __iter__(self) -> Iterator[TensorDictBase]:
+            assert goes_on.wait(60)
+            yield from super().__iter__()
+
+    for name, seconds in {"_PATIENCE_S": 0.2, "_LOOK_EVERY_S": 0.01}.items():
+        monkeypatch.setattr(f"torchrl_etdmpc.training.workers.{name}", seconds)
+    monkeypatch.setattr(
+        distributed, "start_workers", lambda parts, *, engine, numbers, rows: Hanging(parts, numbers, rows, None, 0)
+    )
+    learner = learner_of(config_of(workers=1))
+    learner.collector.act()
+    monkeypatch.setattr(torchrl_logger, "warning", warning)
+    assert len(learner.collector.finish_step()) == 8
+    assert all(
+        text.startswith("no worker has sent rows for 0 minutes; if their simulators hang, Ctrl-C") for text in told
+    )
+    learner.collector.shutdown()
 
 
 @pytest.mark.slow

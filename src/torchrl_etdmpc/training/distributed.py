@@ -31,6 +31,7 @@ from torchrl_etdmpc.training.workers import (
     send_weights,
     start_workers,
     waited_for,
+    warns_that_nothing_comes,
     why_it_failed,
 )
 
@@ -200,7 +201,7 @@ class WorkerCollector:
             NonFiniteError: if a row is not finite; likewise.
         """
         try:
-            rows = waited_for(lambda: next(self._batches), self.while_waiting).reshape(-1)
+            rows = waited_for(lambda: next(self._batches), warns_that_nothing_comes(self.while_waiting)).reshape(-1)
         except WorkLeftError:
             raise
         except Exception as error:

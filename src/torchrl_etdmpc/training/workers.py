@@ -255,6 +255,24 @@ def waited_for(call: Callable[[], T], look: Callable[[], None]) -> T:
     return returned[0]
 
 
+def warns_that_nothing_comes(look: Callable[[], None]) -> Callable[[], None]:
+    """``look`` for a wait for rows that begins now, which warns every five minutes."""
+    began, told = time.monotonic(), 0
+
+    def warn() -> None:
+        nonlocal told
+        look()
+        waited = time.monotonic() - began
+        if waited > (told + 1) * _PATIENCE_S:
+            told += 1
+            torchrl_logger.warning(
+                f"no worker has sent rows for {waited / 60:.0f} minutes; if their simulators hang, Ctrl-C ends and "
+                "saves the run, and resume=true goes on with new workers"
+            )
+
+    return warn
+
+
 def ended_worker(collector: BaseCollector) -> str | None:
     """A sentence on a worker process of this machine that has ended, if there is one."""
     for number, process in enumerate(getattr(collector, "procs", ())):
