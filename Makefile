@@ -66,8 +66,8 @@ report: $(READY)
 	@$(VENV)/bin/python examples/report.py "$(RUN_DIR)" --out "$(RUN_DIR)/report" $(ARGS)
 
 # In the order of their names: the files with few tests, which would otherwise come last, take longest.
-# A test that hangs for ten minutes ends its process with a traceback; a second one ends all.
-test: HANGS := -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true --max-worker-restart=1
+# A test that hangs for a quarter of an hour ends its process with a traceback; a second one ends all.
+test: HANGS := -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true --max-worker-restart=1
 test: export MUJOCO_GL ?= disable
 test: export OMP_NUM_THREADS ?= 1
 test: $(READY)
