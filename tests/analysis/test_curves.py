@@ -402,6 +402,8 @@ def test_a_baseline_with_a_header_only_has_no_rows(tmp_path, header):
         (PER_SEED + "a,walker-run,1,0,inf\n", "column return_mean must hold finite numbers"),
         (PER_SEED + "a,walker-run,1,0,-inf\n", "column return_mean must hold finite numbers"),
         (AS_MEANS + "a,walker-run,,3,1,2\n", "every row needs env_steps"),
+        (PER_SEED + "a,walker-run,,0,1\n", "every row needs a seed"),
+        (PER_SEED + "a,walker-run,,0,1\na,walker-run,2,0,1\n", "every row needs a seed"),
         (b"", "is not a CSV file with a header line"),
         (b"\n\n", "is not a CSV file with a header line"),
         (b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\xff", "mine.csv"),

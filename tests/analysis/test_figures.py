@@ -14,6 +14,7 @@ import pandas as pd  # noqa: E402
 from matplotlib.collections import LineCollection  # noqa: E402
 from matplotlib.colors import to_hex  # noqa: E402
 from matplotlib.container import BarContainer, ErrorbarContainer  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
 
 from torchrl_etdmpc.analysis import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
@@ -214,6 +215,31 @@ def test_negative_returns_are_within_the_panel():
     low, high = axis.get_ylim()
     values = np.concatenate([line.get_ydata() for line in axis.lines])
     assert low <= values.min() and values.max() <= high
+
+
+@pytest.mark.parametrize("lowest", [-1.0, -40.0])
+def test_a_return_a_little_below_0_is_within_the_panel_and_the_picture(lowest, tmp_path, run_log, monkeypatch):
+    table = estimates()
+    axis = curves(table.assign(mean=table["mean"].where(table["env_steps"] > 0, lowest))).axes[0]
+    assert axis.get_ylim()[0] < lowest
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: (drawn.extend(figure.axes), path.write_bytes(b"")))
+    evaluate(run_log, lowest, 900.0, 2500.0, std=0.0)
+    plot_run(tmp_path)
+    assert drawn[0].get_ylim()[0] < lowest
+
+
+def test_an_interval_a_little_below_0_is_no_reason_to_begin_there():
+    table = estimates(error=2.0)
+    axis = curves(table.assign(mean=table["mean"].where(table["method"] != "mine", 1.0))).axes[0]
+    assert interval_corners(axis)[:, 1].min() < 0 and axis.get_ylim()[0] == 0
+
+
+def test_markers_stand_where_it_is_said_that_there_are_evaluations():
+    evaluated = {("mine", TASKS[0], 40_000.0), ("mine", TASKS[0], 120_000.0), ("SAC", TASKS[1], 0.0)}
+    figure = plot_curves(estimates(), tasks=TASKS, methods=METHODS, budget=BUDGET, evaluated=evaluated)
+    marked = [[x for line in drawn_markers(axis) for x in line.get_xdata()] for axis in figure.axes]
+    assert marked == [[40_000], [0], []]
 
 
 def test_bars_are_as_high_as_their_areas_with_1_96_standard_errors():

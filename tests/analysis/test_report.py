@@ -15,7 +15,15 @@ import pandas as pd  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from torchrl_etdmpc.analysis import AGGREGATE, MEAN, Comparison, compare, get_benchmark, write_report  # noqa: E402
+from torchrl_etdmpc.analysis import (  # noqa: E402
+    AGGREGATE,
+    MEAN,
+    Comparison,
+    compare,
+    get_benchmark,
+    write_report,
+)
+from torchrl_etdmpc.analysis import report as module  # noqa: E402
 
 TASKS = ("walker-walk", "walker-run")
 STEPS = (0, 100_000, 200_000)
@@ -47,6 +55,22 @@ def comparison(
         tasks=TASKS,
         points=points,
     )
+
+
+def test_a_seed_that_is_not_done_adds_no_marker_to_the_curves():
+    seeds = {1: (0, 50_000, 100_000, 150_000, 200_000), 2: (0, 50_000, 100_000)}
+    ours = [("ours", TASKS[0], seed, step, 1.0 + step) for seed, steps in seeds.items() for step in steps]
+    bmpc = [("BMPC", TASKS[0], step, step / 2000, 2.0, 5) for step in range(0, 200_001, 25_000)]
+    found = compare(
+        pd.DataFrame(ours, columns=["method", "task", "seed", "env_steps", "return_mean"]),
+        pd.DataFrame(bmpc, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"]),
+        benchmark=get_benchmark("dmc-easy"),
+        tasks=TASKS[:1],
+    )
+    assert {step for method, _, step in found.evaluated if method == "ours"} == {*seeds[1]}
+    axis = module._figures(found)["curves"].axes[0]
+    marked = [{*line.get_xdata()} for line in axis.lines if line.get_linestyle() == "None"]
+    assert {*seeds[1]} in marked and {*range(0, 200_001, 25_000)} in marked
 
 
 def contents(folder: Path) -> dict[str, bytes]:

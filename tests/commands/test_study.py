@@ -20,6 +20,7 @@ pytest.importorskip("matplotlib")
 
 from torchrl_etdmpc import commands  # noqa: E402
 from torchrl_etdmpc.commands import study as study_command  # noqa: E402
+from torchrl_etdmpc.commands.agent_command import AgentCommandConfig  # noqa: E402
 from torchrl_etdmpc.commands.study import StudyName  # noqa: E402
 from torchrl_etdmpc.inspector import Simulator, play_episode  # noqa: E402
 from torchrl_etdmpc.inspector.studies import advantage, choose_states, consistency  # noqa: E402
@@ -126,6 +127,36 @@ def test_a_study_names_the_file_that_it_loaded_and_what_was_changed_of_the_task(
     assert about["checkpoint_sha256"] == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
     assert about["changed_task"] == {"episode_length": 40}
     assert out.startswith("cartpole-balance with episode_length=40, trained for 400 env steps: ")
+
+
+def test_the_checksum_is_that_of_the_file_that_was_loaded(tmp_path, checkpoint, monkeypatch):
+    """A run may replace it while it is read."""
+    own = tmp_path / "last.pt"
+    own.write_bytes(checkpoint.read_bytes())
+    load, loaded = AgentCommandConfig.load, []
+
+    def load_and_replace(config, **options):
+        agent = load(config, **options)
+        loaded.append(hashlib.sha256(own.read_bytes()).hexdigest())
+        if len(loaded) == 1:
+            untrained(tmp_path, num_dynamics=3)
+        return agent
+
+    monkeypatch.setattr(AgentCommandConfig, "load", load_and_replace)
+    agent, _, digest = AgentCommandConfig(checkpoint=str(own)).load_known()
+    assert len(set(loaded)) == 2 and digest == loaded[-1]
+    assert agent.world_model.num_dynamics == 3
+
+
+def test_a_study_whose_figure_cannot_be_drawn_costs_no_other(tmp_path, checkpoint, study, monkeypatch):
+    def figure(result):
+        raise ValueError("nothing to draw")
+
+    monkeypatch.setattr(consistency, "figure", figure)
+    message, out, _ = study("all", f"checkpoint={checkpoint}", "out=here", *FEW)
+    assert message is None
+    assert "consistency: left out: nothing to draw" in out.splitlines()
+    assert sorted(path.stem for path in (tmp_path / "here").glob("*.png")) == sorted({*NAMES} - {"consistency"})
 
 
 def test_the_name_may_be_written_as_a_setting(tmp_path, checkpoint, study):

@@ -93,6 +93,25 @@ def test_every_episode_has_its_line_in_a_table(tmp_path, monkeypatch, checkpoint
     assert table["decisions"].tolist() == [500, 500, 500]
 
 
+def test_an_agent_whose_file_is_replaced_while_it_plays_loses_no_returns(tmp_path, monkeypatch, checkpoint, run_main):
+    """A run that goes on does so."""
+    own = tmp_path / "last.pt"
+    own.write_bytes(checkpoint.read_bytes())
+
+    def play_and_remove(*arguments, **options):
+        own.unlink()
+        return evaluate(*arguments, **options)
+
+    monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.evaluate", play_and_remove)
+    settings = ("episodes=2", "device=cpu", "planner.horizon=1", "task.episode_length=100", "csv=here.csv")
+    message, out, err = run_main(f"checkpoint={own}", *settings)
+    assert (message, err) == (None, "")
+    assert out.startswith(
+        "cartpole-balance with episode_length=100 (planner with horizon=1, trained for 400 env steps)"
+    )
+    assert len((tmp_path / "here.csv").read_text().splitlines()) == 3
+
+
 def test_a_table_is_written_anew_and_another_file_stays(tmp_path, checkpoint, run_main):
     arguments = (f"checkpoint={checkpoint}", "episodes=1", "policy=bare", "device=cpu", "task.episode_length=20")
     (tmp_path / "a.csv").write_text("episode,return,decisions\n0,1.0,1\n1,1.0,1\n")

@@ -10,7 +10,7 @@ pytest.importorskip("dm_control")
 
 from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel  # noqa: E402
 from torchrl_etdmpc.envs import EASY_DMC, HARD_DMC, load_simulator_state, make_env, simulator_state  # noqa: E402
-from torchrl_etdmpc.inspector import Episode, Simulator, play_episode  # noqa: E402
+from torchrl_etdmpc.inspector import Episode, Simulator, episodes, play_episode  # noqa: E402
 from torchrl_etdmpc.planners import BarePolicy  # noqa: E402
 
 needs_gym = pytest.mark.skipif(importlib.util.find_spec("gymnasium") is None, reason="needs gymnasium")
@@ -103,6 +103,25 @@ def test_an_episode_that_terminates_says_so():
     assert rolled.reward.shape == (1,)
     simulator.restore(episode.states[-1])
     assert simulator.roll(episode.action[-1:]).reward.shape == (0,)  # it is over
+
+
+def test_an_episode_that_is_given_up_leaves_no_environment_open(monkeypatch):
+    made = []
+
+    def make(*arguments, **options):
+        made.append(make_env(*arguments, **options))
+        return made[-1]
+
+    monkeypatch.setattr(episodes, "make_env", make)
+    planner = small_planner("walker-walk")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    planner.register_forward_pre_hook(stop)
+    with pytest.raises(KeyboardInterrupt):
+        play_episode(planner, "walker-walk", seed=0)
+    assert [env.is_closed for env in made] == [True]
 
 
 def test_no_steps_are_refused():

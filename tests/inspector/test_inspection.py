@@ -86,7 +86,8 @@ def test_rows_of_a_replay_buffer_have_no_simulator_and_the_page_says_why():
     trace = inspection.plan(State(0, 4, replay=True))
     assert np.array_equal(trace["observation"], rows[4].numpy())
     assert trace.get("real_rewards") is None and trace.get("frames") is None
-    (note,) = trace.manifest["notes"]
+    note, cold = trace.manifest["notes"]
+    assert cold == "Planned without a warm start: a row of the replay buffer holds no plan of the decision before."
     assert note.startswith("There are no frames, and the plan is not rolled in the simulator: a row of the replay")
     with pytest.raises(ValueError, match=r"the row must be in \[0, 5\), the rows of the replay buffer, got 5"):
         inspection.plan(State(0, 5, replay=True))
@@ -139,6 +140,9 @@ def test_an_episode_can_be_played_by_the_policy():
     inspection = Inspection(make(), TASK, steps=3, bare=True)
     trace = inspection.plan(State(0, 2))
     assert not trace["warm_start"].any()
+    cold = "Planned without a warm start: the bare policy, which played, makes no plan of the decision before."
+    assert trace.manifest["notes"][-1] == cold
+    assert cold not in inspection.plan(State(0, 2), {"warm_start": False}).manifest["notes"]
     inspection.close()
 
 

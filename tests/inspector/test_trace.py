@@ -413,6 +413,22 @@ def test_a_file_that_is_no_archive_is_one_line(tmp_path, content):
         load_trace(path)
 
 
+def test_whatever_bit_is_damaged_it_is_one_line(tmp_path):
+    path = trace_plan(make(num_samples=8), OBSERVATION, task="walker-walk").save(tmp_path / "trace.npz")
+    whole, refused = path.read_bytes(), 0
+    flips = torch.randint(8 * len(whole), (400,), generator=torch.Generator().manual_seed(0)).tolist()
+    for bit in (8 * 67, *flips, *range(0, 8 * 60, 3)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        try:
+            load_trace(path)  # where it says the same all the same
+        except TraceError as error:
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > 200
+
+
 def test_a_manifest_that_nests_without_end_is_one_line(tmp_path):
     np.savez(tmp_path / "trace.npz", manifest=np.array("[" * 100_000))
     with pytest.raises(TraceError, match="is not a trace"):

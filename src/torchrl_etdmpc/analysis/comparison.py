@@ -39,6 +39,7 @@ class Comparison:
         grid (ndarray): env steps of the shared evaluation grid.
         seed_curves (DataFrame): of the methods that are known per seed.
         estimates (DataFrame): of all methods, one row per evaluation, and more where seeds differ in their steps.
+        evaluated (set of tuple): method, task and env steps of the estimates that are of all seeds' own evaluations.
         constants (Series): by which tasks are normalised.
         areas (DataFrame): ``method, task, auc, standard_error, seeds``, normalised, with the aggregate as the last
             task.
@@ -67,6 +68,7 @@ class Comparison:
     grid: np.ndarray
     seed_curves: pd.DataFrame
     estimates: pd.DataFrame
+    evaluated: set[tuple[str, str, float]]
     constants: pd.Series
     areas: pd.DataFrame
     finals: pd.DataFrame
@@ -205,7 +207,8 @@ def compare(
     notes += [_why_unpaired(seed_curves, name, base, budget) for name in variants if name not in paired]
     known = (seed_curves, estimates, evaluated, constants, tasks, methods, budget, tables["areas"], tables["finals"])
     notes = (*_notes(*known), *notes)
-    return Comparison(benchmark, tasks, methods, budget, grid, seed_curves, estimates, constants, notes=notes, **tables)
+    parts = (benchmark, tasks, methods, budget, grid, seed_curves, estimates, evaluated, constants)
+    return Comparison(*parts, notes=notes, **tables)
 
 
 def evaluated_methods(

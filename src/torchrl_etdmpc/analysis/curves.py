@@ -325,7 +325,7 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not a CSV file, missing columns, steps in other units, or two rows for one evaluation.
+        ValueError: not a CSV file, missing columns or cells, steps in other units, or two rows for one evaluation.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "curves.csv"
@@ -341,6 +341,8 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
     table = _parse(text, file, ("method", "task", "env_steps"))
     if {"seed", "return_mean"} <= set(table):
         key, numbers, columns = ["method", "task", "seed", "env_steps"], ["env_steps", "return_mean"], SEED_COLUMNS
+        if table["seed"].isna().any():
+            raise ValueError(f"{file}: every row needs a seed.")
     elif "mean" in table:
         table = table.reindex(columns=[*table, *({"standard_error", "seeds"} - set(table))])
         key, numbers = ["method", "task", "env_steps"], ["env_steps", "mean", "standard_error", "seeds"]

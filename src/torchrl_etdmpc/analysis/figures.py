@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +112,7 @@ def plot_curves(
     methods: Sequence[str],
     budget: float,
     points: pd.DataFrame | None = None,
+    evaluated: Collection[tuple[str, str, float]] | None = None,
 ) -> Figure:
     """A grid of tasks: mean return against env steps, shaded 95% intervals (none where the standard error is unknown).
 
@@ -123,6 +124,8 @@ def plot_curves(
         methods (sequence of str): in the order of the legend.
         budget (float): right end of the axis, env steps.
         points (DataFrame, optional): quoted means, drawn as hollow markers that no line joins.
+        evaluated (collection of tuple, optional): method, task and env steps of the estimates that are evaluations, and
+            have a marker. Default: all of them.
 
     >>> estimates = pd.DataFrame({"method": "ours", "task": "walker-walk", "env_steps": [0, 10, 20], "mean": 1.0})
     >>> estimates = estimates.assign(standard_error=0.1, seeds=3)
@@ -147,6 +150,8 @@ def plot_curves(
             curve = found.get((task, method), estimates.iloc[:0])
             _line(axis, curve, styles[method], budget)
             here = curve[curve["env_steps"] <= budget]
+            if evaluated is not None:
+                here = here[[(method, task, step) in evaluated for step in here["env_steps"]]]
             axis.plot(
                 here["env_steps"],
                 here["mean"],
@@ -274,7 +279,9 @@ def _dress(axis, budget: float) -> None:
     axis.set_xlim(0, budget * 1.02)
     axis.autoscale(axis="y")
     low, high = axis.get_ylim()
-    axis.set_ylim(low if low < -0.1 * high else 0, high)
+    drawn = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.lines] or [np.empty(0)])
+    negative = np.min(drawn, initial=0, where=~np.isnan(drawn)) < 0 or low < -0.1 * high  # or a band is
+    axis.set_ylim(low if negative else 0, high)
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.grid(linewidth=0.5, alpha=0.4)
     axis.spines[["top", "right"]].set_visible(False)

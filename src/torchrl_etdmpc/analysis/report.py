@@ -149,7 +149,8 @@ def _figures(comparison: Comparison) -> dict[str, Figure]:
     points = aggregate(normalise(points, comparison.constants), comparison.tasks)
     areas = comparison.areas[comparison.areas["task"] == AGGREGATE]
     options = {"methods": comparison.methods, "budget": comparison.budget}
-    learned = plot_curves(comparison.estimates, tasks=comparison.tasks, points=comparison.points, **options)
+    known = {"points": comparison.points, "evaluated": comparison.evaluated}
+    learned = plot_curves(comparison.estimates, tasks=comparison.tasks, **known, **options)
     figures = {"curves": learned}
     if _normalised(comparison):
         figures["aggregate"] = plot_aggregate(curves, ylabel=normalised, points=points, **options)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from torchrl_etdmpc.envs import Task, get_task
+from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.training import (
     TASK_SETTINGS,
@@ -43,10 +45,15 @@ class AgentCommandConfig:
     extra_terms: str | None = None
     """Likewise ``loss.extra_terms``."""
 
+    @functools.cached_property
+    def stored(self) -> TrainConfig:
+        """The run that the agent is of; read once, since a run that goes on replaces the file."""
+        return trained_with(self.checkpoint)
+
     @property
     def task_spec(self) -> Task:
         """The task that is named, or the one that the agent was trained on, with what its run changed about it."""
-        stored = trained_with(self.checkpoint)
+        stored = self.stored
         if self.task is not None and self.task != stored.task:
             return get_task(self.task, **(_task_settings(stored) | _task_settings(self)))
         return dataclasses.replace(stored.task_spec, **_task_settings(self))
@@ -60,7 +67,7 @@ class AgentCommandConfig:
         Raises:
             ValueError: if code is named that the agent was not trained with, which would change nothing.
         """
-        stored = trained_with(self.checkpoint)
+        stored = self.stored
         own = {"score": stored.planner.score, "reanalyze_score": stored.reanalyze.score}
         for name, trained in (own | {"extra_terms": stored.loss.extra_terms}).items():
             given = getattr(self, name)
@@ -76,10 +83,22 @@ class AgentCommandConfig:
                 )
         return load_agent(self.checkpoint, compile_setting="off", **options)
 
+    def load_known(self, **options: Any) -> tuple[Agent, dict[str, Any], str]:
+        """The agent, its counters, and the sha256 of the very file that it was loaded from.
+
+        Args:
+            **options: as of :meth:`load`.
+        """
+        while True:  # a run that goes on replaces the file
+            digest = checksum(self.checkpoint)
+            agent, _, counters = self.load(**options)
+            if checksum(self.checkpoint) == digest:
+                return agent, counters, digest
+
     @property
     def changed_task(self) -> dict[str, Any]:
         """The settings of the task that are not those of the agent's training."""
-        stored = trained_with(self.checkpoint).task_spec
+        stored = self.stored.task_spec
         return {name: value for name, value in _task_settings(self).items() if getattr(stored, name) != value}
 
 
@@ -97,7 +116,7 @@ class PlannerCommandConfig(AgentCommandConfig):
     @property
     def changed(self) -> dict[str, Any]:
         """The planner's settings that are not those of the agent's training."""
-        stored = trained_with(self.checkpoint).planner
+        stored = self.stored.planner
         now = dataclasses.asdict(self.planner)
         return {name: value for name, value in now.items() if getattr(stored, name) != value}
 

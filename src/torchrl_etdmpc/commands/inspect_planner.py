@@ -13,14 +13,13 @@ import torch
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
-from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, trained_with, with_the_agent_s_planner
+from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, env_sizes, make_env
 from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page import make_page, serve
 from torchrl_etdmpc.inspector.saved_page import free_folder, plotly_script, write_page
-from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.runs.files import make_folder
 from torchrl_etdmpc.training import resolve_device
 
@@ -93,7 +92,7 @@ def main(config: InspectConfig) -> None:
 def _inspection(config: InspectConfig) -> Inspection:
     device = resolve_device(config.device)
     task = config.task_spec
-    own = trained_with(config.checkpoint).task
+    own = config.stored.task
     elsewhere = config.task not in (None, own)
     if elsewhere and config.state.startswith("replay"):
         raise ValueError(
@@ -102,9 +101,9 @@ def _inspection(config: InspectConfig) -> Inspection:
         )
     _need_no_renderer(task)
     sizes = {} if config.state.startswith("replay") else _sizes(task)  # a row of the buffer needs no simulator
-    agent, _, counters = config.load(device=device, **sizes)
+    agent, counters, digest = config.load_known(device=device, **sizes)
     path = Path(config.checkpoint).expanduser()
-    about = {"name": str(config.checkpoint), "sha256": checksum(path), "env_steps": counters.get("env_steps", 0)}
+    about = {"name": str(config.checkpoint), "sha256": digest, "env_steps": counters.get("env_steps", 0)}
     changed = {"changed_task": config.changed_task} if config.changed_task else {}
     store = CheckpointStore(path.parent)
     try:

@@ -24,7 +24,6 @@ from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import env_sizes, make_env
 from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
 from torchrl_etdmpc.inspector.studies import choose_states
-from torchrl_etdmpc.inspector.trace import checksum
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner
 from torchrl_etdmpc.runs import first_line, library_versions, processor, progress_bar, replacing
 from torchrl_etdmpc.runs.files import make_folder, write_whole
@@ -82,9 +81,9 @@ def _main(config: StudyConfig) -> None:
         raise ImportError("this command needs matplotlib; run: pip install matplotlib")
     task, device = config.task_spec, resolve_device(config.device)
     env = make_env(task, seed=config.seed)
-    agent, _, counters = config.load(**env_sizes(env), device=device)
+    agent, counters, digest = config.load_known(**env_sizes(env), device=device)
     env.close(raise_if_closed=False)
-    digest, changed = checksum(config.checkpoint), config.changed_task  # now: a run that goes on replaces the file
+    changed = config.changed_task
     folder = Path(config.out).expanduser()
     make_folder(folder)
     episodes: list[Episode] = []
@@ -122,15 +121,15 @@ def _main(config: StudyConfig) -> None:
         module = importlib.import_module(f"torchrl_etdmpc.inspector.studies.{name}")
         try:
             result = _study(module, name, agent.eval_planner, episodes, simulator, config)
+            lines = module.lines(result)
+            _write(folder, name, module, result, {**about, "study": name, "lines": lines})
         except ValueError as error:  # one head, a simulator that cannot be brought back, episodes that are too short
             left_out.append(name)
             if len(left_out) == len(names):
                 raise
             print(f"{name}: left out: {first_line(error)}")
             continue
-        lines = module.lines(result)
         print("\n".join([f"{name}: {folder / name}.png", *(f"  {line}" for line in lines)]))
-        _write(folder, name, module, result, {**about, "study": name, "lines": lines})
 
 
 def _study(

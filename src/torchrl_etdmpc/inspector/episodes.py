@@ -93,17 +93,19 @@ def play_episode(policy: TensorDictModuleBase, task: str | Task, *, seed: int, s
         env = env.append_transform(planner.make_tensordict_primer())
     device = _device(policy)
     rows: list[TensorDictBase] = []
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        carrier, states, done = env.reset(), [simulator_state(env)], False
-        while not done and (steps is None or len(rows) < steps):
-            with set_exploration_type(ExplorationType.DETERMINISTIC):
-                written = policy(carrier.select(*policy.in_keys, strict=False).to(device))
-            stepped = env.step(carrier.update(written.select(*policy.out_keys, strict=False).to("cpu")))
-            rows.append(stepped)
-            states.append(simulator_state(env))
-            carrier, done = step_mdp(stepped), bool(stepped["next", "done"])
-    env.close(raise_if_closed=False)
+    try:
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(seed)
+            carrier, states, done = env.reset(), [simulator_state(env)], False
+            while not done and (steps is None or len(rows) < steps):
+                with set_exploration_type(ExplorationType.DETERMINISTIC):
+                    written = policy(carrier.select(*policy.in_keys, strict=False).to(device))
+                stepped = env.step(carrier.update(written.select(*policy.out_keys, strict=False).to("cpu")))
+                rows.append(stepped)
+                states.append(simulator_state(env))
+                carrier, done = step_mdp(stepped), bool(stepped["next", "done"])
+    finally:  # the caller may give the episode up
+        env.close(raise_if_closed=False)
     whole = stack(rows)
     carried = None if planner is None else whole.get(planner.plan_mean_key, None)
     return Episode(

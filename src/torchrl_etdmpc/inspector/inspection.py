@@ -31,6 +31,7 @@ _NO_SIMULATOR = (
     "There are no frames, and the plan is not rolled in the simulator: a row of the replay buffer holds what was "
     "observed, not the simulator's state; choose a state of an episode for both."
 )
+_COLD = "Planned without a warm start: {} no plan of the decision before."
 
 
 class State(NamedTuple):
@@ -222,6 +223,9 @@ class Inspection:
         if place is not None:
             job.begin("rolling the plan in the simulator")
             trace, notes = self._simulated(trace, planner, place)
+        if planner.warm_start and plan_mean is None:
+            lacks = "a row of the replay buffer holds" if state.replay else "the bare policy, which played, makes"
+            notes.append(_COLD.format(lacks))
         trace = replace(trace, manifest={**trace.manifest, "notes": notes})
         self._number += 1
         _keep(self.traces, self._number, trace)

@@ -50,6 +50,21 @@ def test_heads_that_err_alike_do_not_know_it(measure):
     assert result.disagreement[..., 0].abs().max() < 1e-6
 
 
+def test_fewer_than_two_pairs_have_no_rank_correlation():
+    pairs = torch.tensor([[1.0, 2.0], [2.0, 5.0], [3.0, 1.0]])
+    for left in (0, 1):
+        missing = torch.arange(3) >= left
+        assert calibration.rank_correlation(pairs.where(~missing[:, None], torch.nan)).isnan()
+    assert calibration.rank_correlation(pairs[:2]) == 1
+    assert calibration.rank_correlation(torch.ones(2, 2)) == 0
+    # Only one of the episodes that resamples are drawn from has states that are left.
+    alone = calibration.Calibration(*torch.rand(2, 6, 2, 1), torch.arange(6) % 3)
+    disagreement, error = (x.where((torch.arange(6) % 3 == 0)[:, None, None], torch.nan) for x in alone[:2])
+    for row in calibration.table(alone._replace(disagreement=disagreement, error=error)):
+        assert abs(row["rank_correlation"]) == 1
+        assert {row["low"], row["high"]} == {row["rank_correlation"]}
+
+
 def test_random_actions_go_both_ways(make_episodes, make_planner, WorldSimulator):
     rolled = []
 

@@ -70,3 +70,16 @@ def test_what_lies_behind_the_end_of_the_task_is_no_error(make_episodes, make_pl
     true[1:, :, 3:] = torch.nan  # all but one ended
     rows = latent_gallery.table(whole._replace(true=true))
     assert [row["error"] for row in rows] == pytest.approx([2**0.5] * 8, rel=1e-4)
+
+
+def test_states_in_which_the_heads_agree_exactly_are_left_out_of_the_ratio(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=2, drift=[[0.1], [-0.1]], policy_gain=1.0)
+    states = choose_states(make_episodes(world, world.optimal_action), 5, ahead=4)
+    result = latent_gallery.latent_gallery(make_planner(world), states, WorldSimulator(world), horizon=4)
+    apart = torch.tensor([1.0, 2.0]).view(2, 1, 1, 1) * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # [b, F, 1, 1]
+    imagined = apart.expand_as(result.imagined).clone()
+    imagined[0] = 0
+    said = latent_gallery.lines(result._replace(imagined=imagined))
+    assert said[0].endswith("geometric mean: 2.00 [2.00, 2.00]")
+    without = latent_gallery.lines(result._replace(imagined=torch.zeros_like(imagined)))
+    assert not any(line.startswith("spread of the heads") for line in without)

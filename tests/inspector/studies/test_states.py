@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchrl_etdmpc.inspector.studies.calibration import rank_correlation
 from torchrl_etdmpc.inspector.studies.replan import true_returns
 from torchrl_etdmpc.inspector.studies.states import choose_states, episode_interval, roll_all
 from torchrl_etdmpc.testing import LineWorld
@@ -64,6 +65,18 @@ def test_the_interval_is_that_of_95_percent_of_the_resamples():
     interval = episode_interval(values, torch.arange(60), resamples=4000)
     error = values.std(correction=0) / 60**0.5
     assert ((interval.high - interval.low) / (2 * error)).item() == pytest.approx(1.96, rel=0.06)
+
+
+def test_an_interval_holds_its_value_and_none_is_beside_no_value():
+    """Every resample has ties that the states have not."""
+    levels, episode = torch.randn(10, generator=torch.Generator().manual_seed(0)), torch.arange(40) // 4
+    noise = torch.randn(40, 2, generator=torch.Generator().manual_seed(100))
+    pairs = levels[episode].unsqueeze(-1) + 0.05 * noise
+    interval = episode_interval(pairs, episode, rank_correlation, resamples=200)
+    assert interval.low < interval.value <= interval.high
+    assert interval.high == interval.value
+    nothing = episode_interval(torch.tensor([1.0, torch.nan, 3.0]), torch.arange(3), lambda rows: rows.mean(0))
+    assert nothing.value.isnan() and nothing.low.isnan() and nothing.high.isnan()
 
 
 def test_one_episode_has_no_interval():

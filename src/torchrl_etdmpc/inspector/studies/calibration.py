@@ -74,7 +74,7 @@ def calibration(
 def rank_correlation(pairs: Tensor) -> Tensor:
     """Spearman's rank correlation of pairs ``[S, ..., 2]``, ``[...]``; 0 where one of them does not vary.
 
-    Pairs of NaN are left out.
+    Pairs of NaN are left out; NaN where fewer than two others are left.
 
     >>> rank_correlation(torch.tensor([[1.0, 10.0], [2.0, 30.0], [3.0, 20.0]])).item()
     0.5
@@ -88,7 +88,8 @@ def rank_correlation(pairs: Tensor) -> Tensor:
     ranks = (ranks - ranks.nanmean(-1, keepdim=True)).nan_to_num(0)
     one, other = ranks.unbind(-2)
     norm = (one.square().sum(-1) * other.square().sum(-1)).sqrt()
-    return torch.where(norm > 0, (one * other).sum(-1) / norm.clamp_min(1e-12), torch.zeros_like(norm))
+    correlation = torch.where(norm > 0, (one * other).sum(-1) / norm.clamp_min(1e-12), torch.zeros_like(norm))
+    return correlation.where((~missing).sum(-1).squeeze(-1) > 1, torch.nan)
 
 
 def table(result: Calibration) -> list[dict[str, Any]]:

@@ -124,9 +124,11 @@ def lines(result: LatentGallery) -> list[str]:
     first, last = result.betas[0], result.betas[-1]
     texts = []
     for name, values in (("spread of the heads", result.spread), ("deviation of the returns", result.deviation)):
-        if not values.any():  # of one head, or of one estimate
+        change = (values[:, -1, -1] / values[:, 0, -1]).log()
+        change = change.where(change.isfinite(), torch.nan)  # heads that agree exactly, as new ones may
+        if change.isnan().all():  # of one head, or of one estimate
             continue
-        ratio = episode_interval((values[:, -1, -1] / values[:, 0, -1]).log(), result.episode)
+        ratio = episode_interval(change, result.episode, lambda rows: rows.nanmean(0))
         low, middle, high = (bound.exp().item() for bound in (ratio.low, ratio.value, ratio.high))
         texts.append(
             f"{name} at the last depth, beta {last:g} over beta {first:g}, geometric mean: {middle:.2f} "

@@ -109,7 +109,8 @@ def episode_interval(
 ) -> Interval:
     """A statistic of states with a 95% bootstrap interval that draws whole episodes.
 
-    States of one episode resemble each other, so that an interval over states would be too narrow.
+    States of one episode resemble each other, so that an interval over states would be too narrow. It holds the value
+    itself, which resamples may all lie on one side of (of Spearman's correlation, they have more ties).
 
     Args:
         values (Tensor): ``[S, ...]``.
@@ -131,7 +132,7 @@ def episode_interval(
     draws = torch.randint(len(groups), (resamples, len(groups)), generator=generator).tolist()
     drawn = torch.stack([statistic(torch.cat([groups[index] for index in draw])) for draw in draws])
     low, high = torch.nanquantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype), dim=0)
-    return Interval(value, low, high)
+    return Interval(value, torch.minimum(low, value), torch.maximum(high, value))
 
 
 def roll_all(simulator: TrueWorld, states: States, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,7 +7,9 @@ import hashlib
 import io
 import json
 import time
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +29,9 @@ versions = functools.cache(library_versions)  # which looks into files
 _MOST_BYTES = 2**30  # of a trace in memory
 # What is not there, is cut off, or was made to take all memory or to nest without end.
 _UNREADABLE = (
-    *(OSError, ValueError, KeyError, zipfile.BadZipFile, DamagedFileError, EOFError),
-    *(MemoryError, RecursionError),
+    *(OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error, DamagedFileError, EOFError),
+    *(MemoryError, RecursionError, NotImplementedError, RuntimeError),
+    *(SyntaxError, tokenize.TokenError),  # of the line that says shape and type of an array
 )
 
 
@@ -255,6 +258,8 @@ def load_trace(path: str | Path) -> Trace:
                     "torchrl_etdmpc that wrote it, or a newer one."
                 )
             arrays = {name: stored[name] for name in stored.files if name != "manifest"}
+    except TraceError:
+        raise
     except _UNREADABLE as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise TraceError(f"{path} is not a trace ({reason}); write one with Trace.save.") from error
