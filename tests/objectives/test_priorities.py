@@ -162,7 +162,7 @@ def test_torchrl_s_prioritised_slices_are_drawn_by_the_errors_that_the_loss_writ
         loss(batch)
         starts = batch[:, 0]
         buffer.update_tensordict_priority(starts)
-        index = starts["index"].reshape(-1)
+        index = starts["index"].reshape(-1).contiguous()  # the trees read memory, whatever the strides
         once = (index == index.unsqueeze(-1)).sum(-1) == 1  # of a row that was drawn twice either error counts
         stored = torch.as_tensor(sampler._sum_tree[index.numpy()])
         errors = starts["td_error"].reshape(-1)

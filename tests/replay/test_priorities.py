@@ -80,5 +80,5 @@ def test_learning_writes_the_priorities_of_its_slices_back(buffer):
         priority = batch["next", "reward"].abs().sum((1, 2))  # one number per slice, whichever it is
         buffer.update_priority(batch["index"][:, 0].flatten(), priority)
     tree = buffer.sampler._sum_tree
-    stored = torch.as_tensor(tree[batch["index"][:, 0].flatten().numpy()])
+    stored = torch.as_tensor(tree[batch["index"][:, 0].flatten().contiguous().numpy()])  # not of the strides
     torch.testing.assert_close(stored, priority, rtol=1e-4, atol=1e-6)
