@@ -237,7 +237,8 @@ def test_an_interval_a_little_below_0_is_no_reason_to_begin_there():
 
 def test_markers_stand_where_it_is_said_that_there_are_evaluations():
     evaluated = {("mine", TASKS[0], 40_000.0), ("mine", TASKS[0], 120_000.0), ("SAC", TASKS[1], 0.0)}
-    figure = plot_curves(estimates(), tasks=TASKS, methods=METHODS, budget=BUDGET, evaluated=evaluated)
+    table = estimates().query("method != 'BMPC' or task != 'walker-run'")  # which has no curve there
+    figure = plot_curves(table, tasks=TASKS, methods=METHODS, budget=BUDGET, evaluated=evaluated)
     marked = [[x for line in drawn_markers(axis) for x in line.get_xdata()] for axis in figure.axes]
     assert marked == [[40_000], [0], []]
 

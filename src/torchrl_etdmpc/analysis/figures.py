@@ -151,7 +151,8 @@ def plot_curves(
             _line(axis, curve, styles[method], budget)
             here = curve[curve["env_steps"] <= budget]
             if evaluated is not None:
-                here = here[[(method, task, step) in evaluated for step in here["env_steps"]]]
+                there = [(method, task, step) in evaluated for step in here["env_steps"]]
+                here = here[np.array(there, bool)]
             axis.plot(
                 here["env_steps"],
                 here["mean"],
