@@ -202,7 +202,8 @@ def build_agent(
     loss = build_loss(world_model, config.loss, discount=discount, ignore_termination=ignore)
     if config.reanalyze.every and not any(key[0] == PLAN for key in loss.in_keys):
         raise ValueError(
-            f"reanalyze.every must be 0 where no term of the loss reads a plan, got {config.reanalyze.every}."
+            "reanalyze.every must be 0 where no term of the loss reads a plan, as with model.action_values, got "
+            f"{config.reanalyze.every}."
         )
     with named_settings("optim", config.optim):
         optim = arguments(config.optim, "batch_size", "updates_per_decision")
