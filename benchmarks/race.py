@@ -9,8 +9,9 @@ The same physics, action repeat, evaluation (mean of 10 episodes without noise o
 one thread. Two settings each, because a library is worth what its better one reaches: `default` is
 Stable-Baselines3's own, `zoo` is what RL Baselines3 Zoo tuned for PyBullet's locomotion tasks (state-dependent
 exploration; hyperparameters of HalfCheetahBulletEnv). Minutes count everything but imports: evaluations too, and for
-ours compilation. Writes `benchmarks/results/cpu/race/<method>/<task>/seed<k>/` and, there,
-`race.png` and `README.md`.
+ours compilation. Writes `benchmarks/results/cpu/race/<method>/<task>/seed<k>/` and, there, `race.png` and `README.md`,
+whose table has mean returns over seeds: after so many env steps, with the minutes until then, and within so many
+minutes, where a run that has ended keeps its last return.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
 }
 ENV_STEPS, EVAL_EVERY, EPISODES = 200_000, 10_000, 10
+STEPS, MINUTES = (50_000, 100_000, 200_000), (10, 15, 25, 45)  # columns of the table
 
 
 class DMCGym(gymnasium.Env):
@@ -181,11 +183,14 @@ def report(ours: list[Path]) -> str:
     ran = {run.path.relative_to(FOLDER).parts[0] for run in runs if run.path.is_relative_to(FOLDER)}
     missing = [f"{a}-{s}" for a in ALGORITHMS for s in SETTINGS if f"{a}-{s}" not in ran]
     lines += [f"Not run yet: {', '.join(missing)}.", ""] if missing else []
-    lines += ["| task | method | seeds | return at 50,000 env steps | minutes until then | last return | minutes |"]
-    lines += ["|---" * 7 + "|"]
+    heads = [f"{steps:,} env steps" for steps in STEPS] + [f"{minutes} minutes" for minutes in MINUTES]
+    lines += [f"| task | method | seeds | {' | '.join(heads)} |"]
+    lines += ["|---" * (3 + len(heads)) + "|"]
     for (task, method), rows in found.groupby(["task", "method"]):
-        early, last = rows[rows["env_steps"] <= 50_000].iloc[-1], rows.iloc[-1]
-        cells = [f"{early['mean']:.0f}", f"{early['minutes']:.1f}", f"{last['mean']:.0f}", f"{last['minutes']:.1f}"]
+        rows = rows.set_index("env_steps")
+        cells = [f"{rows['mean'][at]:.0f} ({rows['minutes'][at]:.1f})" if at in rows.index else "–" for at in STEPS]
+        within = [rows["mean"][rows["minutes"] <= minutes] for minutes in MINUTES]
+        cells += [f"{means.iloc[-1]:.0f}" if len(means) else "–" for means in within]
         seeds = curves[(curves["task"] == task) & (curves["method"] == method)]["seed"].nunique()
         lines.append(f"| {task} | {method} | {seeds} | " + " | ".join(cells) + " |")
     beside = [os.path.relpath(run.path, RESULTS) for run in runs if not run.path.is_relative_to(FOLDER)]

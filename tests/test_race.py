@@ -79,7 +79,7 @@ def test_a_run_is_evaluated_as_ours_are_and_stands_beside_them(script, tmp_path,
     ours = tmp_path / "cpu" / "cartpole-swingup" / "seed1"
     ours.mkdir(parents=True)
     (ours / "summary.json").write_text('{"task": "cartpole-swingup", "preset": "cpu", "seed": 1}')
-    rows = [f"{step},{step // 2},{step},{0.012 * step},500.0,1.0,10" for step in (0, 10_000)]
+    rows = [f"{step},{step // 2},{step},{0.012 * step},{step // 100},1.0,10" for step in (0, 50_000, 90_000)]
     header = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes"
     (ours / "eval.csv").write_text("\n".join([header, *rows, ""]))
     common = ["race.py", "--tasks", "cartpole-swingup", "--seeds", "1", "--env-steps", "10000", "--settings", "zoo"]
@@ -95,6 +95,7 @@ def test_a_run_is_evaluated_as_ours_are_and_stands_beside_them(script, tmp_path,
     monkeypatch.setattr(sys, "argv", ["race.py", "--report-only", str(tmp_path / "cpu")])
     script.main()
     page = (script.FOLDER / "README.md").read_text()
-    assert "| cartpole-swingup | cpu | 1 | 500 | 2.0 | 500 | 2.0 |" in page
+    assert "| 50,000 env steps | 100,000 env steps | 200,000 env steps | 10 minutes | 15 minutes | 25 minutes |" in page
+    assert "| cartpole-swingup | cpu | 1 | 500 (10.0) | – | – | 500 | 500 | 900 |" in page  # 90,000 after 18 minutes
     assert "| cartpole-swingup | TQC (zoo) | 1 |" in page
     assert (script.FOLDER / "race.png").read_bytes().startswith(b"\x89PNG")
