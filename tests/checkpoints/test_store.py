@@ -219,6 +219,19 @@ def test_so_many_checkpoints_are_kept_with_the_replay_files_that_they_need(tmp_p
             os.rename(tmp_path / "resume" / name, tmp_path / name)
 
 
+def test_of_a_checkpoint_whose_manifest_cannot_be_read_the_buffer_s_files_stay(store):
+    work = Work()
+    state = save(store, 100, work.do())
+    manifest = store.folder / "resume" / f"{100:012d}" / "manifest.json"
+    content = manifest.read_text()
+    manifest.write_text(content[:-1])
+    work.buffer.empty()  # so that no file of its rows is shared with what comes
+    save(store, 200, work.do())
+    manifest.write_text(content)
+    (store.folder / "resume" / f"{200:012d}").rename(store.folder / "200")
+    assert load(store.folder) == (f"{100:012d}", state)
+
+
 def test_fewer_than_one_cannot_be_kept(tmp_path):
     with pytest.raises(ValueError, match=r"^keep must be at least 1, got 0\.$"):
         CheckpointStore(tmp_path, keep=0)
@@ -245,6 +258,14 @@ def test_links_are_there_before_the_checkpoint_is(store, monkeypatch):
     monkeypatch.setattr(os, "replace", watched)
     save(store, 100, Work().do())
     assert replaced[-2:] == ["last.pt", f"{100:012d}"]
+
+
+def test_the_name_of_a_checkpoint_is_on_disk_before_those_it_replaces_go(tmp_path, monkeypatch):
+    store, work, synced = CheckpointStore(tmp_path, keep=1), Work(), []
+    save(store, 100, work.do())
+    monkeypatch.setattr("torchrl_etdmpc.checkpoints.store.sync", lambda folder: synced.append(set(os.listdir(folder))))
+    save(store, 200, work.do())
+    assert synced == [{f"{100:012d}", f"{200:012d}"}]
 
 
 def test_the_same_step_again_replaces_its_checkpoint(store):
@@ -284,6 +305,20 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(store, kind, how
     damage(file, how)
     with pytest.warns(UserWarning, match=rf"^going on from .*/{100:012d}, because .*{file.name}"):
         assert load(store.folder) == (f"{100:012d}", first)
+
+
+def test_every_checkpoint_that_is_passed_over_is_told(tmp_path):
+    store, work = CheckpointStore(tmp_path, keep=3), Work()
+    for step in (100, 200, 300):
+        save(store, step, work.do())
+    damaged = [tmp_path / "resume" / f"{step:012d}" / "manifest.json" for step in (300, 200)]
+    for file in damaged:
+        file.unlink()
+    with pytest.warns(UserWarning) as told:
+        assert load(tmp_path)[0] == f"{100:012d}"
+    assert [str(warning.message).partition(", because ")[2] for warning in told] == [
+        f"{file} is missing or damaged." for file in damaged
+    ]
 
 
 def test_any_flipped_bit_of_a_manifest_is_noticed(store):

@@ -408,7 +408,7 @@ def test_a_new_run_is_another_one_for_wandb_than_the_leftover_before_it(begun):
     "files",
     [
         {"eval_csv": ROW.format(1000)},
-        {"train_csv": ROW.format(40)},
+        {"train_csv": ROW.format(1)},
         {"eval_csv": "my,own,table\n1,2,3\n"},
         {"eval_csv": "env_steps\nmany\n"},
         {"summary_json": "{}"},

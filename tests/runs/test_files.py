@@ -97,6 +97,16 @@ def test_a_file_system_that_cannot_sync_folders_does_without(tmp_path, monkeypat
     assert names(tmp_path) == {"notes.txt"}
 
 
+def test_a_file_that_cannot_be_synced_is_not_taken_for_written(tmp_path, monkeypatch):
+    def refused(descriptor: int) -> None:
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+
+    monkeypatch.setattr(os, "fsync", refused)
+    with pytest.raises(OSError, match="Invalid argument"):
+        write_whole(tmp_path / "notes.txt", NEW)
+    assert names(tmp_path) == set()
+
+
 WRITERS = {
     "write_whole": lambda path: write_whole(path, NEW),
     "write_tensors": lambda path: write_tensors(path, {"x": torch.arange(5000)}),

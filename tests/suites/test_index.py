@@ -189,9 +189,9 @@ def test_only_finished_runs_are_remembered_and_read_again_when_they_change(runs,
     assert len(read_again()) == 4
     assert repr(RunIndex(tmp_path / "index.sqlite").read(runs)) == repr(first)
     assert read_again() == [runs[2].name, runs[3].name]  # somebody may have begun to train them
-    small.write_finished(runs[1], returns=7.0)
+    small.write_finished(runs[1], returns=700.0)  # as many bytes
     os.utime(runs[1].path / "eval.csv", ns=(1, time.time_ns()))
-    assert known.read(runs)[1].latest_return == 7.0
+    assert known.read(runs)[1].latest_return == 700.0
     assert runs[1].name in read_again()
     longer = small.experiment(seeds=(1, 2, 3, 4), budget=800).runs(tmp_path / "runs")
     assert known.read(longer)[0].state == "stopped"
@@ -203,6 +203,18 @@ def test_a_run_whose_summary_was_removed_is_not_remembered_as_finished(runs, sma
     assert known.read(runs)[0].state == "finished"
     (runs[0].path / "summary.json").unlink()  # as by a longer budget
     assert known.read(runs)[0].state == "stopped"
+
+
+def test_what_is_known_of_a_run_stays_when_another_changes(runs, small, tmp_path, read_again):
+    small.write_finished(runs[0])
+    small.write_tables(runs[1], 100)
+    known = RunIndex(tmp_path / "index.sqlite")
+    known.read(runs)
+    small.write_finished(runs[1])
+    known.read(runs)
+    read_again()
+    known.read(runs)
+    assert read_again() == [runs[2].name, runs[3].name]
 
 
 def test_an_index_that_is_removed_or_damaged_is_made_again(runs, small, tmp_path, read_again):

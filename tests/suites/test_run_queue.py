@@ -119,6 +119,15 @@ def test_a_run_that_cannot_be_started_is_tried_again_later(queue_of, monkeypatch
     assert said[-1].endswith("cannot be started: No space left on device; given up")
 
 
+def test_a_run_that_cannot_be_started_is_not_tried_again_at_once(queue_of, monkeypatch):
+    monkeypatch.setattr(run_queue, "_LOOK_AGAIN_S", 60.0)
+    queue = queue_of(seeds=(1, 2))
+    queue.failed_to_begin(queue.next(), "No space left on device")
+    assert queue.next().seed == 2
+    assert queue.next() is None
+    assert queue.left
+
+
 def test_a_run_that_another_process_has_is_waited_for_however_long(queue_of, small, said, monkeypatch):
     monkeypatch.setattr(run_queue, "_LOOK_AGAIN_S", 0.0)
     in_use = [True]
@@ -187,6 +196,16 @@ def test_a_waiting_run_of_a_trial_that_ended_early_never_begins(queue_of, small,
     queue.to_be_stopped()
     assert queue.next().seed == 2
     assert queue.next() is None
+
+
+def test_the_trials_are_not_looked_at_all_the_time(queue_of, monkeypatch):
+    monkeypatch.setattr(run_queue, "_LOOK_AGAIN_S", 60.0)
+    trials, looks = TwoTrials([]), []
+    monkeypatch.setattr(trials, "look", lambda: looks.append(1) or [])
+    queue = queue_of(trials=[trials])
+    for _ in range(3):
+        queue.to_be_stopped()
+    assert len(looks) == 1
 
 
 def test_a_run_whose_trial_ended_early_is_not_waited_for(queue_of):

@@ -56,6 +56,14 @@ def test_the_buffer_is_on_the_run_s_device_if_it_fits(monkeypatch, setting, devi
     assert replay_device(config, device, needed) == torch.device(expected)
 
 
+@pytest.mark.parametrize(("short_of", "expected"), [(0, "cuda:1"), (1, "cpu")])
+def test_the_buffer_is_on_a_gpu_if_all_of_its_rows_fit(monkeypatch, short_of, expected, tiny_config):
+    config = tiny_config()
+    free = 2 * config.replay_rows * row_bytes(24, 6) - short_of
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda which: (free, free))
+    assert build_replay(config, "cuda:1", sizes=(24, 6)).storage.device == torch.device(expected)
+
+
 def test_a_row_has_the_bytes_that_the_rule_counts_with(tiny_config):
     pytest.importorskip("dm_control")
     from torchrl_etdmpc.envs import make_env

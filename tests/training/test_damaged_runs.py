@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -116,6 +117,38 @@ def test_a_save_that_failed_half_way_leaves_nothing_out_of_the_next_one(tmp_path
     assert (expected == actual).all()
 
 
+def test_a_checkpoint_that_failed_is_tried_again_in_its_time(tmp_path, monkeypatch, small_config, make_run):
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    run = make_run(small_config(checkpoint_minutes=2.0), tmp_path)
+    run.learner.step()
+    run.parts["late"] = part = Refusing()
+    part.refuses = True
+    clock[0] = 121.0
+    assert run.checkpoints.overdue
+    with pytest.warns(UserWarning, match="^no checkpoint at 2 env steps"):
+        assert not run.checkpoints.save()
+    assert not run.checkpoints.overdue  # or every step would write it in vain
+    clock[0] = 242.0
+    assert run.checkpoints.overdue
+
+
+def test_a_best_agent_that_the_disk_did_not_take_is_written_with_the_next_checkpoint(
+    tmp_path, monkeypatch, small_config, make_run
+):
+    def fail(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    run = make_run(small_config(), tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr("torchrl_etdmpc.training.agent_file.write_whole", fail)
+        with pytest.warns(UserWarning, match=r"best\.pt cannot be written \(No space left on device\)"):
+            run.best.note(5.0)
+    run.learner.step()
+    assert run.checkpoints.save()
+    assert read_agent_file(run.best.path)["counters"]["env_steps"] == 0
+
+
 def test_a_run_that_cannot_be_saved_at_all_ends_before_anything_is_lost(tmp_path, small_config, make_run):
     run = make_run(small_config(), tmp_path)
     part = run.parts["late"] = Refusing()
@@ -202,6 +235,18 @@ def test_a_run_whose_end_cannot_be_saved_is_not_finished(small_disk, straight, s
     assert resumed.env_steps == 90
     resumed.run()
     assert results(resumed, run_dir) == straight(config)
+
+
+def test_a_run_whose_last_checkpoint_cannot_be_written_is_not_finished(tmp_path, small_config, make_run):
+    run = make_run(small_config(total_env_steps=52), tmp_path)
+    part = run.parts["late"] = Refusing()
+    at_decisions(run, {26: lambda: setattr(part, "refuses", True)})  # there is room for the tables and the summary
+    with (
+        pytest.warns(UserWarning, match="^no checkpoint at 52 env steps"),
+        pytest.raises(OSError, match="made its 52 env steps, but the end could not be saved"),
+    ):
+        run.run()
+    assert not run.log.directory.finished
 
 
 def test_a_damaged_buffer_can_be_gone_on_with_on_request(tmp_path, finished, small_config, make_run):

@@ -41,6 +41,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     load_agent,
     preset,
     read_run_config,
+    resumed_config,
 )
 from torchrl_etdmpc.training.ray_cluster import RayCluster  # noqa: E402
 from torchrl_etdmpc.training.signals import RunInterrupted  # noqa: E402
@@ -463,6 +464,11 @@ def test_an_agent_file_is_loaded_by_one_process_and_its_run_gone_on_with_by_work
     assert "80 env steps" in launch(longer, ["total_env_steps", "workers", "resume"])
     with pytest.raises(ValueError, match="is a run of workers; go on with the command distributed, or start a new"):
         read_run_config(directory)
+
+
+def test_a_run_may_go_on_with_other_workers():
+    changes = {"workers": 3, "engine": "ray", "address": "auto"}
+    assert resumed_config(config_of(), changes, changes) == config_of(**changes)
 
 
 def test_a_run_of_one_process_is_not_gone_on_with_by_workers(tmp_path):

@@ -17,6 +17,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     read_run_config,
     resumed_config,
 )
+from torchrl_etdmpc.training.signals import WorkLeftError  # noqa: E402
 
 PLACES = {
     "in the first evaluation": (lambda run: (run.evaluator.env, "step_and_maybe_reset"), 5),
@@ -44,6 +45,20 @@ def test_a_run_that_was_stopped_anywhere_ends_as_if_it_had_not_been(
     resumed = make_run(config, tmp_path, resume=True)
     resumed.run()
     assert results(resumed, tmp_path) == straight(config)
+
+
+def test_a_run_that_is_asked_to_stop_does_not_wait_for_the_end_of_an_evaluation(
+    tmp_path, small_config, make_run, stop_at
+):
+    run = make_run(small_config(), tmp_path)
+    run.learner.step()
+    steps, play = [], run.evaluator.env.step_and_maybe_reset
+    run.evaluator.env.step_and_maybe_reset = lambda tensordict: steps.append(1) or play(tensordict)
+    stop_at(run, run.evaluator.env, "step_and_maybe_reset", 3)
+    with pytest.raises(RunInterrupted, match="^stopped at 2 env steps and saved in "):
+        run.evaluate()
+    assert len(steps) == 3
+    assert not (tmp_path / "eval.csv").exists()
 
 
 @pytest.mark.parametrize(
@@ -184,6 +199,23 @@ def test_a_run_does_what_its_saved_state_says_is_due(tmp_path, small_config, mak
     assert [row["env_steps"] for row in read_table(tmp_path / "train.csv")] == [48]
     assert resumed.state.stage == "learn"
     assert resumed.state.due == []
+
+
+def test_a_step_that_a_signal_broke_off_calls_for_nothing(tmp_path, small_config, make_run):
+    run = make_run(small_config(), tmp_path)
+    for _ in range(20):
+        run.learner.step()
+    assert run.learner.passed(run.config.log_every)  # the step before did, and its row is written
+    run.state.load_state_dict(run.state.state_dict() | {"stage": "learn", "due": []})
+
+    def leave(**_: Any) -> None:
+        run.stop.requested = True
+        raise WorkLeftError
+
+    run.learner.step = leave
+    with pytest.raises(RunInterrupted):
+        run.run()
+    assert run.state.due == []
 
 
 @pytest.mark.parametrize("stage", ["random", "pretrain", "learn"])

@@ -3,18 +3,20 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import importlib.util
+import multiprocessing
 import os
 import signal
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_etdmpc.checkpoints import CheckpointStore
+from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.collectors import StepCollector
 from torchrl_etdmpc.envs import Task, register_task
 from torchrl_etdmpc.runs import RunDirectory, RunLog
@@ -217,11 +219,18 @@ def test_a_command_may_repeat_a_setting_of_the_run_but_not_change_it(command):
     )
 
 
+FREE: dict[str, Any] = {"resume": "on", "run_dir": "elsewhere", "total_env_steps": 200}
+FREE |= {"device": "cuda:1", "threads": 3, "compile": "default", "logger": "tensorboard"}
+FREE |= {"checkpoint_every": 7, "checkpoint_minutes": 3.0, "checkpoint_keep": 5}
+
+
+def test_every_setting_that_no_result_depends_on_may_change(command):
+    assert resumed_config(command(), FREE, FREE) == command(**FREE)
+
+
 def test_every_setting_that_a_result_depends_on_must_stay(command):
     saved = command()
-    free = {"resume", "run_dir", "total_env_steps", "device", "threads", "compile", "logger"}
-    free |= {"checkpoint_every", "checkpoint_minutes", "checkpoint_keep"}
-    for name in flat(saved.to_dict()).keys() - free:
+    for name in flat(saved.to_dict()).keys() - FREE.keys():
         with pytest.raises(ValueError, match=f"=another was asked for, but this run was started with .*{name}="):
             resumed_config(saved, {name: "another"}, [name])
 
@@ -386,6 +395,44 @@ def test_others_are_kept_out_while_it_trains_and_let_in_however_it_ends(command,
     assert not directory.path.exists()  # no step was made, so nothing stays
 
 
+@needs_dm_control
+def test_a_run_that_cannot_begin_closes_its_environments(command, monkeypatch, process):
+    module, made = importlib.import_module("torchrl_etdmpc.training.launch"), []
+    make_env = module.make_env
+
+    def watched(*args: Any, **options: Any) -> Any:
+        made.append(make_env(*args, **options))
+        return made[-1]
+
+    monkeypatch.setattr(module, "make_env", watched)
+    with pytest.raises(ValueError, match="num_elites"):
+        launch(command(planner={"num_elites": 100}))
+    assert [env.is_closed for env in made] == [True, True]
+
+
+@needs_dm_control
+def test_a_logger_is_closed_though_the_run_fails(command, monkeypatch, process):
+    closed, logger = [], SimpleNamespace(shutdown=lambda: closed.append(True))
+    monkeypatch.setattr(importlib.import_module("torchrl_etdmpc.training.launch"), "make_logger", lambda *_: logger)
+    monkeypatch.setattr(TrainingRun, "run", lambda run: kill())
+    with pytest.raises(Killed):
+        launch(command())
+    assert closed == [True]
+
+
+@needs_dm_control
+def test_a_finished_run_that_cannot_be_restored_stays_finished(command, process):
+    directory = begin(command())
+    save(directory)  # of a run that had no parts
+    finish(directory, command())
+    asked = command(resume="auto", total_env_steps=200)
+    with pytest.raises(CheckpointError, match=r"^cannot resume: .*/000000000080 lacks agent, "):
+        launch(asked, ["total_env_steps"])
+    assert directory.finished
+    assert read_run_config(directory) == command()
+    assert is_free(directory)
+
+
 @pytest.mark.parametrize("how", ["changed", "missing", "cut off", "a pipe"])
 def test_a_damaged_configuration_is_taken_from_the_weights(command, tiny_config, how):
     directory = begin(command())
@@ -517,6 +564,27 @@ def test_a_library_that_makes_another_error_of_a_signal_does_not_hide_it(command
     with pytest.raises(RunInterrupted, match=r"^stopped before the first step, with nothing to save; start it ag"):
         launch(command())
     assert list(tmp_path.iterdir()) == []
+
+
+@needs_dm_control
+def test_a_signal_before_the_first_step_ends_the_run_s_processes_and_nobody_else_s(command, monkeypatch, process):
+    killed = []
+
+    class Child:
+        def kill(self) -> None:
+            killed.append(self)
+
+    children, own = [Child()], Child()
+    monkeypatch.setattr(multiprocessing, "active_children", lambda: list(children))
+
+    def interrupted(*_: Any) -> None:
+        children.append(own)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(TrainingRun, "precompile", interrupted)
+    with pytest.raises(RunInterrupted):
+        launch(command())
+    assert killed == [own]
 
 
 @needs_dm_control
