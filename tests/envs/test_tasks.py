@@ -114,11 +114,14 @@ def test_a_path_to_code_is_not_followed(tmp_path, monkeypatch):
         get_task("has_side_effect:make")
     assert str(error.value) == (
         "task 'has_side_effect:make' names code, which must be given on the command line: task=has_side_effect:make, "
-        "or code=has_side_effect:make of a suite"
+        "or code=has_side_effect:make of a suite. In Python, call "
+        "torchrl_etdmpc.envs.import_task('has_side_effect:make') before."
     )
     for name in ("gym/has_side_effect:Pendulum-v1", "has_side_effect"):  # gymnasium.make would import the module
         with pytest.raises(ValueError, match=r"^unknown task"):
             get_task(name)
+    with pytest.raises(ValueError, match=r"a module of yours .*, with NAME = get_task\('gym/Pendulum-v1'\) in it\.$"):
+        get_task("gym/has_side_effect:Pendulum-v1")
     assert "has_side_effect" not in sys.modules
 
 

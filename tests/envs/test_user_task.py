@@ -256,6 +256,25 @@ def test_a_task_of_a_file_keeps_its_numbers_and_maker(folder):
     assert simulator_state(of_a_suite) is not None
 
 
+def test_an_id_of_ones_own_is_a_task_behind_the_code_that_registers_it(folder):
+    gymnasium = pytest.importorskip("gymnasium")
+    (folder / "registers.py").write_text(
+        "import gymnasium\n"
+        "from gymnasium.envs.classic_control import PendulumEnv\n"
+        "from torchrl_etdmpc.envs import get_task\n"
+        "gymnasium.register('OfOnesOwn-v0', entry_point=PendulumEnv, max_episode_steps=30)\n"
+        "mine = get_task('gym/OfOnesOwn-v0', terminates=False)\n"
+    )
+    try:
+        task = import_task("registers:mine")
+        assert (task.name, task.episode_length, task.terminates) == ("registers:mine", 30, False)
+        env = make_env(task, seed=0)
+        check_env(env)  # actions within -1 and 1 among others, as with every task of Gymnasium
+        assert env.rollout(100).shape == (30,)
+    finally:
+        gymnasium.registry.pop("OfOnesOwn-v0", None)
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [
@@ -268,6 +287,11 @@ def test_a_task_of_a_file_keeps_its_numbers_and_maker(folder):
             r"task 'no\.such\.file:make': there is no module 'no\.such\.file' on Python's path or .*",
         ),
         ("my_file.py:make", r"task 'my_file\.py:make': there is no module 'my_file\.py' .*; write my_file:make\."),
+        (
+            "gym/my_file:Cart-v0",
+            r"task 'gym/my_file:Cart-v0' is no path to a task\. An id that your own code registers is named by a "
+            r"module of yours that imports this code: task=MODULE:NAME, with NAME = get_task\('gym/Cart-v0'\) in it\.",
+        ),
         ("my_file:other", r"task 'my_file:other': the module 'my_file' \(.*my_file\.py\) has no 'other'\."),
         ("more_tasks:VALUE", r"task 'more_tasks:VALUE' must be a function or a Task, got int\."),
         ("more_tasks:number", r"task 'more_tasks:number' must return a TorchRL environment, got int\."),

@@ -203,3 +203,12 @@ def test_bins_in_half_precision_mean_what_they_mean_in_single(dtype):
     torch.testing.assert_close(weights, two_hot_encode(x, bins), rtol=0, atol=1e-6)
     rounded = two_hot_encode(x.to(dtype), bins.to(dtype))  # these four are numbers of half precision too
     torch.testing.assert_close(rounded, weights, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_logits_and_bins_in_half_precision_are_decoded_as_exactly_as_the_result_is_rounded(dtype):
+    logits = two_hot_encode(torch.linspace(300, 500, 201), BINS).clamp_min(1e-9).log().to(dtype)
+    exact = two_hot_decode(logits.double(), BINS.double())
+    decoded = two_hot_decode(logits, BINS.to(dtype))
+    assert decoded.dtype == dtype
+    torch.testing.assert_close(decoded.double(), exact, rtol=0.51 * torch.finfo(dtype).eps + 1e-5, atol=0)

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_etdmpc.functional import sample_elite
 from torchrl_etdmpc.testing import LineWorld
 
 _MODES = ("elite", "mean", "best")
@@ -94,3 +95,11 @@ def test_elites_are_drawn_as_often_as_they_weigh(make_planner, rows, elites_by_h
 def test_the_target_has_the_spread_of_the_last_fit(make_planner, states):
     plan = make_planner().plan(states(3), trace=True)
     assert torch.equal(plan.scale, plan.trace.std[:, -1, 0])
+
+
+def test_in_half_precision_too_elites_are_drawn_by_weight(make_planner):
+    planner = make_planner(num_elites=8)
+    noise = planner.draw_noise(40_000, dtype=torch.bfloat16, generator=torch.Generator().manual_seed(0))
+    drawn = sample_elite(torch.full((40_000, 8), 1 / 8, dtype=torch.bfloat16), noise.elite)
+    shares = torch.bincount(drawn, minlength=8) / len(drawn)
+    torch.testing.assert_close(shares, torch.full((8,), 1 / 8), atol=0.007, rtol=0)  # four standard errors

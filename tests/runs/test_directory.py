@@ -370,9 +370,10 @@ def leave_behind(directory: RunDirectory, **files: str) -> None:
         {},
         {"eval_csv": ROW.format(0), "train_csv": ""},
         {"checkpoints__resume__000000000000__manifest_json": "{}", "checkpoints__best_pt": "", "checkpoints__a_pt": ""},
+        {"checkpoints__resume__.000000000000.old__manifest_json": "{}"},
         {"tensorboard__events": "", "curve_png": ""},
     ],
-    ids=["configuration", "first evaluation", "first checkpoint", "loggers and curve"],
+    ids=["configuration", "first evaluation", "first checkpoint", "the same moved aside", "loggers and curve"],
 )
 def test_a_run_that_made_no_step_is_taken_over(tmp_path, files):
     directory = RunDirectory(tmp_path / "run")
@@ -413,6 +414,7 @@ def test_a_new_run_is_another_one_for_wandb_than_the_leftover_before_it(begun):
         {"eval_csv": "env_steps\nmany\n"},
         {"summary_json": "{}"},
         {"checkpoints__resume__000000000050__manifest_json": "{}"},
+        {"checkpoints__resume__.000000000050.old__manifest_json": "{}"},
         {"config_yaml": "my: own"},
         {"config_yaml": "- a list"},
         {"config_yaml": "\x00"},

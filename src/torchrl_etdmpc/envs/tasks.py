@@ -237,7 +237,8 @@ def suite_task(name: str, **told: Any) -> Task:
     if ":" in str(name):
         # A stored run or checkpoint may hold such a name, and no file may make us import code.
         raise ValueError(
-            f"task {name!r} names code, which must be given on the command line: task={name}, or code={name} of a suite"
+            f"task {name!r} names code, which must be given on the command line: task={name}, or code={name} of a "
+            f"suite. In Python, call torchrl_etdmpc.envs.import_task({name!r}) before."
         )
     robot, _, goal = str(name).partition("-")
     if robot in _HUMANOID_ROBOTS and goal in _HUMANOID_GOALS:
@@ -288,6 +289,14 @@ def _gymnasium_ids() -> list[str]:
     return [f"gym/{name}-v{version}" for name, version in sorted(newest.items())]
 
 
+def of_own_code(env_id: str) -> str:
+    """What names a Gymnasium id that a user's own code registers, which no command imports by itself."""
+    return (
+        "An id that your own code registers is named by a module of yours that imports this code: task=MODULE:NAME, "
+        f"with NAME = get_task('gym/{env_id.rpartition(':')[2]}') in it."
+    )
+
+
 def _gymnasium_task(name: str, told: dict[str, Any]) -> Task:
     if importlib.util.find_spec("gymnasium") is None:
         raise ImportError(f"task {name!r} needs gymnasium, which is missing; run: {INSTALL_GYMNASIUM}")
@@ -297,7 +306,9 @@ def _gymnasium_task(name: str, told: dict[str, Any]) -> Task:
     if env_id not in gymnasium.registry:
         nearest = difflib.get_close_matches(env_id, gymnasium.registry, n=3)
         hint = f"did you mean {', '.join(f'gym/{other}' for other in nearest)}? " if nearest else ""
-        raise ValueError(f"unknown task {name!r}; {hint}task=list on the command line lists those of MuJoCo.")
+        raise ValueError(
+            f"unknown task {name!r}; {hint}task=list on the command line lists those of MuJoCo. " + of_own_code(env_id)
+        )
     limit = gymnasium.registry[env_id].max_episode_steps
     if limit in (None, -1) and "episode_length" not in told:
         raise ValueError(f"Gymnasium sets no time limit for {env_id}; give one in env steps: task.episode_length=")

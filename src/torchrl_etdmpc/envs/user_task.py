@@ -20,7 +20,7 @@ from torchrl.envs.transforms import VecNormV2
 from torchrl_etdmpc.envs.episode import equal_states, is_plain, transform_states
 from torchrl_etdmpc.envs.layers import simulator_of, transforms_of, wrappers_of
 from torchrl_etdmpc.envs.make import find_maker
-from torchrl_etdmpc.envs.tasks import Maker, Task, register_task
+from torchrl_etdmpc.envs.tasks import Maker, Task, of_own_code, register_task
 
 __all__ = ["import_attribute", "import_task"]
 
@@ -68,6 +68,8 @@ def import_task(
     """
     told: dict[str, Any] = {"action_repeat": action_repeat, "episode_length": episode_length, "terminates": terminates}
     told = {field: value for field, value in told.items() if value is not None}
+    if path.startswith("gym/"):  # gymnasium.make takes MODULE:ID
+        raise ValueError(f"task {path!r} is no path to a task. {of_own_code(path)}")
     found = import_attribute(path, "task")
     if isinstance(found, Task):
         maker: Maker = partial(_make_as, found.name, find_maker(found))

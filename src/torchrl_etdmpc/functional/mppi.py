@@ -98,7 +98,7 @@ def elite_weights(scores: Tensor, inverse_temperature: float) -> Tensor:
 
     Args:
         scores (Tensor): elite scores, minus infinity for a place without a candidate, shape ``[..., K]``.
-        inverse_temperature (float): >= 0. The lineage calls it "temperature".
+        inverse_temperature (float): >= 0. TD-MPC2 calls it ``temperature``.
 
     Returns:
         Tensor: shape ``[..., K]``; uniform where no score is finite.

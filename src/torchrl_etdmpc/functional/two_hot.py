@@ -63,16 +63,21 @@ def two_hot_decode(logits: Tensor, bins: Tensor) -> Tensor:
         bins (Tensor): bin centres in symlog space, shape ``[M]``.
 
     Returns:
-        Tensor: scalars in the units of the environment, shape ``[...]``.
+        Tensor: scalars in the units of the environment, shape ``[...]``; under autocast in single precision.
 
     >>> bins = torch.linspace(-10, 10, 101)
     >>> weights = two_hot_encode(torch.tensor(7.0), bins)
     >>> round(two_hot_decode(weights.clamp_min(1e-30).log(), bins).item(), 3)
     7.0
     """
-    if torch.is_autocast_enabled(logits.device.type):  # a product in half precision, of which values would learn
-        return symexp((logits.float().softmax(-1) * bins).sum(-1))
-    return symexp(logits.softmax(-1) @ bins)
+    halved, autocast = bins.dtype in (torch.float16, torch.bfloat16), torch.is_autocast_enabled(logits.device.type)
+    if not (halved or autocast):
+        return symexp(logits.softmax(-1) @ bins)
+    if halved:  # rounded bins are not evenly spaced, as those are that two_hot_encode places a scalar between
+        places = torch.linspace(0, 1, len(bins), device=bins.device)
+        bins = torch.lerp(bins[0].float(), bins[-1].float(), places)
+    decoded = symexp((logits.float().softmax(-1) * bins).sum(-1))  # no product in half precision: values learn of it
+    return decoded if autocast else decoded.to(logits.dtype)
 
 
 def two_hot_cross_entropy(logits: Tensor, target: Tensor, bins: Tensor) -> Tensor:

@@ -31,20 +31,20 @@ class WorldModel(nn.Module):
     Args:
         observation_dim (int, optional): O, size of the flat observation; ``None`` with an encoder of one's own.
         action_dim (int): A.
-        latent_dim (int): L, a multiple of ``simnorm_dim``.
-        mlp_dim (int): hidden size of dynamics, reward, value, policy and termination.
-        encoder_dim (int): hidden size of the encoder.
-        encoder_layers (int): hidden layers of the encoder; thesis Table A.1 counts the output layer too.
-        num_dynamics (int): F, dynamics heads.
-        num_values (int): V, value heads.
-        simnorm_dim (int): group size of SimNorm.
-        num_bins (int): M, bins of the reward and value distributions.
-        bin_min (float): first bin centre, in symlog space.
-        bin_max (float): last bin centre, in symlog space.
-        dropout (float): of the first hidden layer of the value heads, in [0, 1).
-        log_std_min (float): smallest log standard deviation of the policy.
-        log_std_max (float): largest log standard deviation of the policy.
-        activation (str): ``"mish"``, ``"silu"`` or ``"relu"``.
+        latent_dim (int): L, a multiple of ``simnorm_dim``. Default: 512.
+        mlp_dim (int): hidden size of dynamics, reward, value, policy and termination. Default: 512.
+        encoder_dim (int): hidden size of the encoder. Default: 256.
+        encoder_layers (int): hidden layers of the encoder; thesis Table A.1 counts the output layer too. Default: 1.
+        num_dynamics (int): F, dynamics heads. Default: 4.
+        num_values (int): V, value heads. Default: 2.
+        simnorm_dim (int): group size of SimNorm. Default: 8.
+        num_bins (int): M, bins of the reward and value distributions. Default: 101.
+        bin_min (float): first bin centre, in symlog space. Default: -10.
+        bin_max (float): last bin centre, in symlog space. Default: 10.
+        dropout (float): of the first hidden layer of the value heads, in [0, 1). Default: 0.01.
+        log_std_min (float): smallest log standard deviation of the policy. Default: -3.
+        log_std_max (float): largest log standard deviation of the policy. Default: 1.
+        activation (str): ``"mish"``, ``"silu"`` or ``"relu"``. Default: ``"mish"``.
         termination (bool): whether to build a termination head. Default: ``False`` (DMC never terminates).
         normalize_observations (bool): whether observations are standardised by their running mean and variance, which
             the losses move in training mode (:class:`~torchrl_etdmpc.modules.RunningNorm`). Default: ``False``.

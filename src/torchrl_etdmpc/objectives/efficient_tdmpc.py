@@ -29,7 +29,7 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         world_model (WorldModel): the networks, shared with the caller (the planner sees every update).
 
     Keyword Args:
-        discount (float): gamma, in (0, 1].
+        discount (float): gamma, in (0, 1], the planners' too.
         consistency_coef (float): weight of predicting the next latent, not negative. Default: 20.
         reward_coef (float): weight of predicting the reward, not negative. Default: 0.1.
         value_coef (float): weight of the value targets, not negative. Default: 0.1.

@@ -27,7 +27,7 @@ class TDMPC2Loss(LatentRolloutLoss):
         world_model (ActionValueWorldModel): the networks, shared with the caller (the planner sees every update).
 
     Keyword Args:
-        discount (float): gamma, in (0, 1].
+        discount (float): gamma, in (0, 1], the planners' too.
         consistency_coef (float): Default: 20.
         reward_coef (float): Default: 0.1.
         value_coef (float): Default: 0.1.

@@ -95,7 +95,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             ``[..., D, F, V]`` to ``[...]``, see :class:`~torchrl_etdmpc.planners.Score`. Default: ``"mean"``.
         beta (float): penalty on the standard deviation of the heads' mean, for a named score. Default: 0.
         discount (float): gamma, in (0, 1]. Default: 0.99.
-        inverse_temperature (float): of the elites' weights (the lineage calls it "temperature"). Default: 0.5.
+        inverse_temperature (float): of the elites' weights (TD-MPC2 calls it ``temperature``). Default: 0.5.
         std_min (float): Default: 0.05.
         std_max (float): largest standard deviation, and that of the first candidates of a wide search. Default: 2.
         first_action (str): ``"elite"`` (one elite drawn by its weight; BMPC), ``"mean"`` (the fitted mean; the thesis'
@@ -307,7 +307,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
     def make_tensordict_primer(self) -> PlanPrimer:
         """Transform that adds the warm start to an environment's reset and zeroes it there.
 
-        Collectors find it by themselves (``auto_register_policy_transforms=True``). At the first reset it raises a
+        TorchRL's collectors append it with ``auto_register_policy_transforms=True``. At the first reset it raises a
         ``ValueError`` where environment and model do not fit (:func:`~torchrl_etdmpc.envs.check_spaces`).
         """
         device, dtype = self.env.device_and_dtype()
@@ -440,7 +440,10 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         drawn = {
             "proposals": torch.randn(*batch_size, self.num_proposals, *actions, **options),
             "candidates": torch.randn(*batch_size, self.iterations, free, *actions, **options),
-            "elite": torch.rand(*batch_size, self.num_elites, **options),
+            # Not in half precision: of its few numbers many are the same, and of those the best elite's wins.
+            "elite": torch.rand(
+                *batch_size, self.num_elites, **options | {"dtype": torch.promote_types(dtype, torch.float32)}
+            ),
             "action": torch.randn(*batch_size, actions[-1], **options),
         }
         if not self._num_action_values:

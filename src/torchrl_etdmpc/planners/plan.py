@@ -22,7 +22,7 @@ class PlanNoise(NamedTuple):
     candidates: Tensor
     """Standard normal, ``[..., I, N - P, H, A]``, one block per iteration."""
     elite: Tensor
-    """Uniform on [0, 1), ``[..., K]``: picks the elite."""
+    """Uniform on [0, 1), ``[..., K]``, in single precision at least: picks the elite."""
     action: Tensor
     """Standard normal, ``[..., A]``: the exploration of a training action."""
     bootstrap: Tensor

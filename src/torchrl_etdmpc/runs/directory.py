@@ -6,6 +6,7 @@ import contextlib
 import csv
 import hashlib
 import os
+import re
 import shutil
 import stat
 import time
@@ -79,7 +80,9 @@ class RunDirectory:
             ours = {"task", "preset", "seed"} <= set(self.read_config())
         except (OSError, ValueError, TypeError):
             return False
-        later = any(folder.name.strip("0") for folder in self.checkpoints.glob("resume/[0-9]*"))
+        # A checkpoint of the same step as the one that is being saved is called .STEP.old for a moment.
+        saved = (folder for name in ("[0-9]*", ".*.old") for folder in self.checkpoints.glob(f"resume/{name}"))
+        later = any(re.search("[1-9]", folder.name) for folder in saved)
         return ours and not (os.path.lexists(self.summary) or later or any(map(_has_steps, (self.train, self.eval))))
 
     @property
