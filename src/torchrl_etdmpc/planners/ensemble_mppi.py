@@ -437,13 +437,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         options: dict[str, Any] = {"device": device, "dtype": dtype}
         if generator is not None:  # torch.randn(..., generator=None) takes no symbolic size
             options["generator"] = generator
+        single: dict[str, Any] = options | {"dtype": torch.promote_types(dtype, torch.float32)}
         drawn = {
             "proposals": torch.randn(*batch_size, self.num_proposals, *actions, **options),
             "candidates": torch.randn(*batch_size, self.iterations, free, *actions, **options),
             # Not in half precision: of its few numbers many are the same, and of those the best elite's wins.
-            "elite": torch.rand(
-                *batch_size, self.num_elites, **options | {"dtype": torch.promote_types(dtype, torch.float32)}
-            ),
+            "elite": torch.rand(*batch_size, self.num_elites, **single),
             "action": torch.randn(*batch_size, actions[-1], **options),
         }
         if not self._num_action_values:
