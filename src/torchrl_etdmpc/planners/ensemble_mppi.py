@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import ExplorationType
@@ -16,17 +17,7 @@ from torchrl.envs.utils import exploration_type
 from torchrl.modules import MPCPlannerBase
 
 from torchrl_etdmpc.envs.check import model_sizes
-from torchrl_etdmpc.functional import (
-    Elites,
-    Gaussian,
-    clipped_sample,
-    elite_weights,
-    fit_gaussian,
-    sample_elite,
-    sample_sequences,
-    select_elites,
-    shift_plan,
-)
+from torchrl_etdmpc.functional import Gaussian, clipped_sample, shift_plan
 from torchrl_etdmpc.keys import (
     ACTION,
     FALLBACK,
@@ -53,11 +44,12 @@ from torchrl_etdmpc.planners.arguments import (
     check_fit,
     floating_dtype,
 )
-from torchrl_etdmpc.planners.imagination import imagined_returns, policy_gaussian, propose_sequences
+from torchrl_etdmpc.planners.imagination import Imagination, policy_gaussian, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
 from torchrl_etdmpc.planners.plan import Plan, PlanNoise, PlanTrace
 from torchrl_etdmpc.planners.primer import PlanPrimer
 from torchrl_etdmpc.planners.scores import Score, ScoreFunction, ScoreName, make_score
+from torchrl_etdmpc.planners.search import Search, chosen_sequence, search
 
 
 class EnsembleMPPIPlanner(MPCPlannerBase):
@@ -204,15 +196,15 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.inverse_temperature = inverse_temperature
         self.std_min = std_min
         self.std_max = std_max
-        self.first_action = first_action
-        self.eval_first_action = eval_first_action
+        self.first_action: FirstAction = first_action
+        self.eval_first_action: FirstAction = eval_first_action
         self.warm_start = warm_start
         self.initial: InitialPlan = initial
         self.scoring_dtype = floating_dtype(scoring_dtype)
         self.proposal_log_std_bounds = both_or_none(proposal_log_std_min, proposal_log_std_max)
         self.explore: bool | None = None
         self.compiled_plan: Callable[..., Plan] | None = None
-        vars(self)["_imagination"] = _Imagination(env.world_model)
+        vars(self)["_imagination"] = Imagination(env.world_model)
         self.observation_key, self.action_key = unravel_key(observation_key), unravel_key(action_key)
         self.latent_key = None if latent_key is None else unravel_key(latent_key)
         self.is_init_key = unravel_key(is_init_key)
@@ -500,15 +492,26 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             noise = PlanNoise(*(draw.reshape(states, *draw.shape[len(batch) :]) for draw in noise))
         shape = (states, self.horizon, self.world_model.action_dim)
         start = latent.new_zeros(shape) if plan_mean is None else shift_plan(plan_mean.reshape(shape))
-        search = self._search(latent, self._initial(latent, start), noise, trace)
-        loc, scale, value = self._target(latent, search, noise.elite, explore)
+        found = search(
+            self._initial(latent, start),
+            self._proposals(latent, noise.proposals),
+            noise.candidates,
+            partial(self._evaluate, self._return_table(latent), noise),
+            iterations=self.iterations,
+            num_elites=self.num_elites,
+            inverse_temperature=self.inverse_temperature,
+            std_min=self.std_min,
+            std_max=self.std_max,
+            trace=trace,
+        )
+        loc, scale, value = self._target(latent, found, noise.elite, explore)
         # A copy: who adds noise to the action in place does not move the target that is distilled.
         action = clipped_sample(loc, scale, noise.action) if explore else loc.clone()
-        outputs = (action, loc, scale, value, search.gaussian.mean, search.fallback)
+        outputs = (action, loc, scale, value, found.gaussian.mean, found.fallback)
         outputs = [field.reshape(batch + field.shape[1:]) for field in outputs]
         if not trace:
             return Plan(*outputs, trace=None)
-        stacked = (torch.stack(field, dim=1) for field in zip(*search.steps, strict=True))
+        stacked = (torch.stack(field, dim=1) for field in zip(*found.steps, strict=True))
         return Plan(*outputs, trace=PlanTrace(*(field.reshape(batch + field.shape[1:]) for field in stacked)))
 
     @torch.no_grad()
@@ -526,7 +529,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         Returns:
             Tensor: ``[B, N, D, F, V]`` with D = H, or 1 for a score of the last depth.
         """
-        return self._imagined_returns(latent, actions, self._cast_weights(latent), None)
+        return self._return_table(latent)(actions)
 
     def _initial(self, latent: Tensor, start: Tensor) -> Gaussian:
         """The Gaussian ``[B, H, A]`` of the first candidates; ``start`` is the warm start."""
@@ -535,95 +538,38 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         mean, std = policy_gaussian(self.world_model, latent, self.horizon, self.proposal_log_std_bounds)
         return Gaussian(mean, std.clamp(self.std_min, self.std_max))
 
-    def _search(self, latent: Tensor, gaussian: Gaussian, noise: PlanNoise, trace: bool) -> _Search:
-        """Draws candidates, scores them and refits the Gaussian, once per iteration, for states ``[B, L]``."""
-        weights_cast = self._cast_weights(latent)
-        proposals = self._proposals(latent, noise.proposals)
-        steps, proposed = [], None
-        for iteration in range(self.iterations):
-            actions = sample_sequences(gaussian, noise.candidates[:, iteration])
-            if proposed is None:
-                actions = torch.cat([proposals, actions], dim=1)
-                scores, returns = self._evaluate(latent, actions, weights_cast, noise, iteration)
-                proposed = proposals, scores[:, : self.num_proposals], returns[:, : self.num_proposals]
-            else:
-                # Departure from TD-MPC2, which scores the proposals anew in every iteration: they keep the scores of
-                # the first one, which differ from the later ones by other draws alone.
-                drawn = actions, *self._evaluate(latent, actions, weights_cast, noise, iteration)
-                actions, scores, returns = (torch.cat(pair, dim=1) for pair in zip(proposed, drawn, strict=True))
-            elites = select_elites(actions, scores, self.num_elites)
-            weights = elite_weights(elites.scores, self.inverse_temperature)
-            fitted = fit_gaussian(elites.actions, weights, std_min=self.std_min, std_max=self.std_max)
-            fallback = elites.scores[:, 0].isinf()
-            keep = fallback[:, None, None]
-            gaussian = Gaussian(*(torch.where(keep, old, new) for old, new in zip(gaussian, fitted, strict=True)))
-            if trace:
-                steps.append(PlanTrace(actions, scores, returns, *gaussian))
-        # There is at least one iteration.
-        return _Search(gaussian, elites, weights, fallback, steps)  # pyright: ignore[reportPossiblyUnboundVariable]
-
     def _proposals(self, latent: Tensor, noise: Tensor) -> Tensor:
         """The policy's sequences ``[B, P, H, A]``."""
         if not self.num_proposals or not has_policy(self.world_model):
             return noise
         return propose_sequences(self.world_model, latent, noise, self.proposal_log_std_bounds)
 
-    def _target(self, latent: Tensor, search: _Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _target(self, latent: Tensor, found: Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Mean ``[B, A]``, standard deviation ``[B, A]`` and value ``[B]`` of the target.
 
         On fallback mean and standard deviation are the policy's; without a policy, those of the last Gaussian that was
         fitted to finite scores, which is the warm start where there was none.
         """
-        loc, value = self._choose(search, uniform, explore)
-        fallback = search.fallback
+        choice = self.first_action if explore else self.eval_first_action
+        loc, value = chosen_sequence(found, choice, uniform)
+        fallback, std = found.fallback, found.gaussian.std[:, 0]
         if has_policy(self.world_model):
             policy_mean, policy_log_std = self.world_model.policy(latent)
             policy_std = policy_log_std.exp().clamp(self.std_min, self.std_max)
         else:
-            policy_mean, policy_std = search.gaussian.mean[:, 0], search.gaussian.std[:, 0]
+            policy_mean, policy_std = found.gaussian.mean[:, 0], std
         loc = torch.where(fallback.unsqueeze(-1), policy_mean, loc)
-        scale = torch.where(fallback.unsqueeze(-1), policy_std, search.gaussian.std[:, 0])
+        scale = torch.where(fallback.unsqueeze(-1), policy_std, std)
         return loc, scale, torch.where(fallback, torch.nan, value)
 
-    def _choose(self, search: _Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor]:
-        """First action ``[B, A]`` and value ``[B]`` of the chosen sequence."""
-        # Departure from the thesis, whose formula has the fitted mean, and from BMPC, which draws an elite in every
-        # mode: the texts disagree, so it is a choice; the best candidate acts in evaluation.
-        choice = self.first_action if explore else self.eval_first_action
-        first, scores = search.elites.actions[:, :, 0], search.elites.scores
-        if choice == "mean":
-            return search.gaussian.mean[:, 0], (search.weights * torch.where(scores.isfinite(), scores, 0)).sum(-1)
-        if choice == "best":
-            return first[:, 0], scores[:, 0]
-        index = sample_elite(search.weights, uniform).unsqueeze(-1)
-        action = first.gather(1, index.unsqueeze(-1).expand(-1, -1, first.shape[-1]))
-        return action.squeeze(1), scores.gather(1, index).squeeze(1)
-
-    def _cast_weights(self, latent: Tensor) -> dict[str, Tensor] | None:
-        """The weights in the scoring dtype, or ``None`` where that is their own."""
-        if self.scoring_dtype is None or self.scoring_dtype == latent.dtype:
-            return None
-        return {name: weight.to(self.scoring_dtype) for name, weight in self._imagined().named_parameters()}
-
-    def _imagined(self) -> _Imagination:
-        """That of the model which the planner has now: its environment may have been given another one."""
-        if self._imagination.world_model is not self.world_model:
-            vars(self)["_imagination"] = _Imagination(self.world_model)
-        return self._imagination
-
     def _evaluate(
-        self,
-        latent: Tensor,
-        actions: Tensor,
-        weights_cast: dict[str, Tensor] | None,
-        noise: PlanNoise,
-        iteration: int,
+        self, return_table: Callable[..., Tensor], noise: PlanNoise, actions: Tensor, iteration: int
     ) -> tuple[Tensor, Tensor]:
-        """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]`` from ``[B, L]``."""
+        """Scores ``[B, N]`` and return table ``[B, N, D, F, V]`` of sequences ``[B, N, H, A]``."""
         bootstrap = None
         if noise.heads.shape[-1]:
             bootstrap = noise.bootstrap[:, iteration, -actions.shape[1] :], noise.heads[:, iteration]
-        returns = self._imagined_returns(latent, actions, weights_cast, bootstrap)
+        returns = return_table(actions, bootstrap=bootstrap)
         scores = self.score(returns)
         if scores.shape != actions.shape[:2]:
             raise ValueError(
@@ -632,45 +578,22 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             )
         return scores, returns
 
-    def _imagined_returns(
-        self,
-        latent: Tensor,
-        actions: Tensor,
-        weights_cast: dict[str, Tensor] | None,
-        bootstrap: tuple[Tensor, Tensor] | None,
-    ) -> Tensor:
-        """The return table, by weights that are cast once for many calls."""
-        options: dict[str, Any] = {"discount": self.discount, "all_depths": self.score.depths == "all"}
-        if weights_cast is None:
-            return self._imagined()(latent, actions, bootstrap=bootstrap, **options)
-        if bootstrap is not None:
-            bootstrap = bootstrap[0].to(self.scoring_dtype), bootstrap[1]
-        inputs = latent.to(self.scoring_dtype), actions.to(self.scoring_dtype)
-        options |= {"bootstrap": bootstrap, "dtype": latent.dtype}
-        return functional_call(self._imagined(), weights_cast, inputs, options)
+    def _return_table(self, latent: Tensor) -> Callable[..., Tensor]:
+        """From sequences ``[B, N, H, A]`` to the return table from ``latent [B, L]`` on; casts the weights once."""
+        imagination = self._imagination
+        if imagination.world_model is not self.world_model:  # the environment has been given another one
+            imagination = vars(self)["_imagination"] = Imagination(self.world_model)
+        options = {"discount": self.discount, "all_depths": self.score.depths == "all"}
+        dtype = self.scoring_dtype
+        if dtype is None or dtype == latent.dtype:
+            return partial(imagination, latent, **options)
+        weights = {name: weight.to(dtype) for name, weight in imagination.named_parameters()}
+        cast = latent.to(dtype)
 
+        def return_table(actions: Tensor, bootstrap: tuple[Tensor, Tensor] | None = None) -> Tensor:
+            if bootstrap is not None:
+                bootstrap = bootstrap[0].to(dtype), bootstrap[1]
+            further = options | {"bootstrap": bootstrap, "dtype": latent.dtype}
+            return functional_call(imagination, weights, (cast, actions.to(dtype)), further)
 
-class _Search(NamedTuple):
-    """Where the iterations ended."""
-
-    gaussian: Gaussian
-    """The last fit, ``[B, H, A]``."""
-    elites: Elites
-    """Of the last iteration."""
-    weights: Tensor
-    """Of the elites, ``[B, K]``."""
-    fallback: Tensor
-    """Whether no candidate had a finite score, ``[B]``."""
-    steps: list[PlanTrace]
-    """Every iteration, if asked for."""
-
-
-class _Imagination(nn.Module):
-    """The return table as a module, so that it can be called with other weights."""
-
-    def __init__(self, world_model: PredictionModel) -> None:
-        super().__init__()
-        self.world_model = world_model
-
-    def forward(self, latent: Tensor, actions: Tensor, **options: Any) -> Tensor:
-        return imagined_returns(self.world_model, latent, actions, **options)
+        return return_table

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_etdmpc.functional import Gaussian, return_table
 from torchrl_etdmpc.modules.prediction import ActionValueModel, PolicyModel, PredictionModel
@@ -112,6 +112,18 @@ def imagined_returns(
         rewards, values = rewards.to(dtype), values.to(dtype)
         alive = None if alive is None else alive.to(dtype)
     return return_table(rewards.permute(2, 3, 0, 1), values.permute(2, 3, 0, 1, 4), discount, alive)
+
+
+class Imagination(nn.Module):
+    """:func:`imagined_returns` as a module, so that ``functional_call`` can give it other weights."""
+
+    def __init__(self, world_model: PredictionModel) -> None:
+        super().__init__()
+        self.world_model = world_model
+
+    def forward(self, latent: Tensor, actions: Tensor, **options: Any) -> Tensor:
+        """The return table."""
+        return imagined_returns(self.world_model, latent, actions, **options)
 
 
 def sampled_values(world_model: ActionValueModel, latent: Tensor, noise: Tensor, heads: Tensor) -> Tensor:
