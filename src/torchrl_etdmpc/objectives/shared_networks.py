@@ -84,6 +84,11 @@ class SharedNetworksLoss(LossModule):
         """Names of the networks that this loss has."""
         return [name for name in self._attributes if f"{name}_params" in self._modules]
 
+    def _followed(self) -> list[tuple[str, Any, Any]]:
+        """Of each network with a target: its name, the entries of the target and its own."""
+        names = [name.removeprefix("target_") for name in self._modules if name.startswith("target_")]
+        return [(name.removesuffix("_params"), self._modules[f"target_{name}"], self._modules[name]) for name in names]
+
     def _scalars(self) -> dict[str, Tensor]:
         """The loss' own buffers of no dimension."""
         own = vars(self).get("_buffers", {})  # which are not there yet while the base class is constructed
@@ -211,10 +216,8 @@ class SharedNetworksLoss(LossModule):
         """Draws new weights for the networks that this loss trains; target parameters become copies of the new ones."""
         for name in self._shared():
             draw_new_weights(self.__dict__[name])
-        parameters: dict[str, Any] = self._modules
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                target.data.update_(parameters[name.removeprefix("target_")].data)
+        for _, target, own in self._followed():
+            target.data.update_(own.data)
 
     def network_parameters(self) -> dict[str, list[nn.Parameter]]:
         """Every parameter of this loss, once, by its network: of the world model, or of a term that brings its own."""
@@ -225,14 +228,10 @@ class SharedNetworksLoss(LossModule):
 
     def target_parameters(self) -> dict[str, list[tuple[Tensor, nn.Parameter]]]:
         """Each parameter of a target network and the trained one that it follows, by network."""
-        parameters: dict[str, Any] = self._modules
         found: dict[str, list[tuple[Tensor, nn.Parameter]]] = {}
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                own = parameters[name.removeprefix("target_")]
-                pairs = [(target.get(key), own.get(key)) for key in target.keys(True, True)]
-                trained = [pair for pair in pairs if isinstance(pair[1], nn.Parameter) and pair[1].requires_grad]
-                found[name.removeprefix("target_").removesuffix("_params")] = trained
+        for name, target, own in self._followed():
+            pairs = [(target.get(key), own.get(key)) for key in target.keys(True, True)]
+            found[name] = [pair for pair in pairs if isinstance(pair[1], nn.Parameter) and pair[1].requires_grad]
         return found
 
     def targets(self) -> dict[str, dict[str, Tensor]]:
@@ -241,16 +240,13 @@ class SharedNetworksLoss(LossModule):
         ``SoftUpdate`` moves parameters alone, and a target whose statistics stay where they began is another network.
         """
         found: dict[str, dict[str, Tensor]] = {}
-        parameters: dict[str, Any] = self._modules
-        for name, target in parameters.items():
-            if name.startswith("target_"):
-                network = name.removeprefix("target_").removesuffix("_params")
-                entries = found[network] = {}
-                for key in target.keys(True, True):
-                    own = parameters[f"{network}_params"].get(key)
-                    trained = isinstance(own, nn.Parameter)
-                    entry = target.get(key).data if trained else own.detach().clone()  # it moves before it is read
-                    entries[key if isinstance(key, str) else ".".join(key)] = entry
+        for name, target, own in self._followed():
+            entries = found[name] = {}
+            for key in target.keys(True, True):
+                value = own.get(key)
+                trained = isinstance(value, nn.Parameter)
+                entry = target.get(key).data if trained else value.detach().clone()  # it moves before it is read
+                entries[key if isinstance(key, str) else ".".join(key)] = entry
         return found
 
 
