@@ -148,12 +148,12 @@ def test_world_models_that_share_a_network_each_count(make_loss, make_world_mode
 
 
 def test_a_world_model_that_is_gone_takes_its_entries_along(make_loss, make_world_model):
-    before = set(update_count._counts)
+    before = set(update_count._counts_by_parameter)
     loss = make_loss("whole", make_world_model())
-    assert set(update_count._counts) > before
+    assert set(update_count._counts_by_parameter) > before
     del loss
     gc.collect()
-    assert set(update_count._counts) <= before
+    assert set(update_count._counts_by_parameter) <= before
 
 
 @pytest.mark.parametrize("updates", [1, 3])

@@ -22,8 +22,8 @@ class _Count:
     """In the model's order."""
     after: Tensor
     """The version that the last counted step left behind."""
-    counts: ReferenceType[Optimizer] | None = None
-    """The optimiser whose steps are the updates: of those that have stepped and are still there, the one that holds the
+    optimizer: ReferenceType[Optimizer] | None = None
+    """The one whose steps are the updates: of those that have stepped and are still there, the one that holds the
     first parameter. It need not hold those that are frozen."""
 
     @property
@@ -47,7 +47,7 @@ class _Count:
             self.after = version.clone()
 
 
-_counts: dict[int, tuple[_Count, ...]] = {}
+_counts_by_parameter: dict[int, tuple[_Count, ...]] = {}
 """By the id of a trained parameter, which lives as long as its entry. A compiled step looks up the parameters of its
 optimiser alone: models that come and go meanwhile are nothing to it."""
 
@@ -77,7 +77,7 @@ def count_updates(world_model: WorldModel, trained: Iterable[nn.Parameter]) -> N
     count.trained = tuple(parameter for parameter in world_model.parameters() if id(parameter) in known)
     count.restart(world_model.version)
     for parameter in count.trained:
-        _counts[id(parameter)] = (*_counts.get(id(parameter), ()), count)
+        _counts_by_parameter[id(parameter)] = (*_counts_by_parameter.get(id(parameter), ()), count)
 
 
 def restart_count(world_model: nn.Module) -> None:
@@ -97,28 +97,28 @@ def _count_for(world_model: nn.Module) -> _Count | None:
 
 
 def _counts_of(parameters: Iterable[Tensor]) -> list[_Count]:
-    found = [count for parameter in parameters for count in _counts.get(id(parameter), ())]
+    found = [count for parameter in parameters for count in _counts_by_parameter.get(id(parameter), ())]
     return list({id(count): count for count in found}.values())
 
 
 def _forget(count: _Count) -> None:
     for parameter in count.trained:
-        others = tuple(other for other in _counts.pop(id(parameter), ()) if other is not count)
+        others = tuple(other for other in _counts_by_parameter.pop(id(parameter), ()) if other is not count)
         if others:
-            _counts[id(parameter)] = others
+            _counts_by_parameter[id(parameter)] = others
 
 
 @functools.cache
 def _listen() -> None:
-    register_optimizer_step_post_hook(_count)
+    register_optimizer_step_post_hook(_after_step)
 
 
-def _count(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+def _after_step(optimizer: Optimizer, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
     for count in _counts_of(parameter for group in optimizer.param_groups for parameter in group["params"]):
         place = count.place(optimizer)
-        counting = None if count.counts is None else count.counts()
+        counting = None if count.optimizer is None else count.optimizer()
         if place < len(count.trained) and (optimizer is counting or place <= count.place(counting)):
-            count.counts = ref(optimizer)
+            count.optimizer = ref(optimizer)
             version = count.version
             if version is not None:
                 version += version != count.after.to(version.device) + 1
