@@ -143,7 +143,7 @@ def check_terms(
     for argument, term in named:
         if not isinstance(term, Term):
             raise TypeError(f"{argument} must be a list of Term(name, function, coef), got {term!r} in it.")
-        _check_networks(term, networks)
+        _check_names(term, networks)
     trained = {name for _, term in named for name in term.networks}
     taken = set(reserved)
     for argument, term in named:
@@ -164,7 +164,7 @@ def check_terms(
             raise ValueError(f"the target {idle[0]!r} of the term {term.name!r} is of a network that no term trains.")
 
 
-def _check_networks(term: Term, networks: Collection[str]) -> None:
+def _check_names(term: Term, networks: Collection[str]) -> None:
     for argument in ("networks", "targets", "keys", "metrics"):
         names = getattr(term, argument)
         if isinstance(names, str):

@@ -67,7 +67,7 @@ def floating_dtype(dtype: torch.dtype | str | None) -> torch.dtype | None:
     return dtype
 
 
-def both_or_none(low: float | None, high: float | None) -> tuple[float, float] | None:
+def proposal_bounds(low: float | None, high: float | None) -> tuple[float, float] | None:
     """The bounds of the policy's log std while it proposes; refuses one without the other."""
     if low is None and high is None:
         return None

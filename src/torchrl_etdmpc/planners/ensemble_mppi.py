@@ -38,11 +38,11 @@ from torchrl_etdmpc.planners.arguments import (
     FirstAction,
     InitialPlan,
     ScoringDtype,
-    both_or_none,
     check_budget,
     check_choices,
     check_fit,
     floating_dtype,
+    proposal_bounds,
 )
 from torchrl_etdmpc.planners.imagination import Imagination, policy_gaussian, propose_sequences
 from torchrl_etdmpc.planners.latent_env import LatentEnv
@@ -201,7 +201,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.warm_start = warm_start
         self.initial: InitialPlan = initial
         self.scoring_dtype = floating_dtype(scoring_dtype)
-        self.proposal_log_std_bounds = both_or_none(proposal_log_std_min, proposal_log_std_max)
+        self.proposal_log_std_bounds = proposal_bounds(proposal_log_std_min, proposal_log_std_max)
         self.explore: bool | None = None
         self.compiled_plan: Callable[..., Plan] | None = None
         vars(self)["_imagination"] = Imagination(env.world_model)
