@@ -109,26 +109,25 @@ class LatentEnv(ModelBasedEnvBase):
         if not torch.compiler.is_compiling():
             self.follow()
         model = self.world_model
-        observation = None if tensordict is None else tensordict.get(self.observation_key, None)
-        if tensordict is None or (LATENT not in tensordict.keys() and observation is None):
-            self._refuse_other_states(tensordict)
-            batch_size = self.batch_size if tensordict is None else tensordict.batch_size
+        given = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
+        batch_size = given.batch_size
+        latent, observation = given.get(LATENT, None), given.get(self.observation_key, None)
+        if latent is None and observation is None:
+            self._refuse_other_states(given)
             device, dtype = self.device_and_dtype()
             if model.observation_dim is None:
                 latent = torch.zeros(*batch_size, model.latent_dim, device=device, dtype=dtype)
             else:
-                latent = model.encode(torch.zeros(*batch_size, model.observation_dim, device=device, dtype=dtype))
-        elif LATENT in tensordict.keys():
-            batch_size, latent = tensordict.batch_size, tensordict.get(LATENT)
-        else:
-            batch_size, latent = tensordict.batch_size, model.encode(observation)
+                observation = torch.zeros(*batch_size, model.observation_dim, device=device, dtype=dtype)
+        if latent is None:
+            latent = model.encode(observation)
         done = torch.zeros(*batch_size, 1, dtype=torch.bool, device=latent.device)
         return TensorDict({LATENT: latent, DONE: done, TERMINATED: done.clone()}, batch_size=batch_size)
 
-    def _refuse_other_states(self, tensordict: TensorDictBase | None) -> None:
+    def _refuse_other_states(self, tensordict: TensorDictBase) -> None:
         """A tensordict of states under names that this environment does not know would start it from zeros."""
         own = {key for spec in (self.full_done_spec, self.full_reward_spec, self.full_action_spec) for key in spec}
-        found = [] if tensordict is None else [key for key in tensordict.keys() if key not in own | {"_reset", NEXT}]
+        found = [key for key in tensordict.keys() if key not in own | {"_reset", NEXT}]
         if found:
             raise KeyError(
                 f"LatentEnv starts from {LATENT!r} or {self.observation_key!r}, got {', '.join(map(repr, found))}; "
