@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.functional.gaussian import clipped_sample
+
 
 class Gaussian(NamedTuple):
     """Diagonal Gaussian over action sequences.
@@ -64,7 +66,7 @@ def sample_sequences(plan: Gaussian, noise: Tensor) -> Tensor:
     >>> sample_sequences(plan, torch.tensor([[[0.5]], [[4.0]]])).flatten().tolist()
     [0.5, 1.0]
     """
-    return (plan.mean.unsqueeze(-3) + plan.std.unsqueeze(-3) * noise).clamp(-1, 1)
+    return clipped_sample(plan.mean.unsqueeze(-3), plan.std.unsqueeze(-3), noise)
 
 
 def select_elites(actions: Tensor, scores: Tensor, num_elites: int) -> Elites:
