@@ -403,7 +403,7 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             )
         if is_init is not None:
             starts = is_init.bool().reshape(*carried.shape[:-2], 1, 1)  # [..., 1], or [...] as some environments do
-            carried = torch.where(starts, torch.zeros_like(carried), carried)
+            carried = torch.where(starts, 0, carried)
         return carried, True
 
     def draw_noise(
