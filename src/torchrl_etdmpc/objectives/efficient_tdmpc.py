@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
-from torchrl_etdmpc.objectives.policy import policy_term, register_running_scale
+from torchrl_etdmpc.objectives.policy import policy_term
+from torchrl_etdmpc.objectives.running_scale import register_scale
 from torchrl_etdmpc.objectives.terms import KLDirection, Term
 from torchrl_etdmpc.objectives.value import value_term
 from torchrl_etdmpc.objectives.world_model import model_terms
@@ -108,14 +109,14 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
                     value_expectile=value_expectile,
                     discount=discount,
                 ),
-                policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef),
+                policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef, kl_direction=kl_direction),
             ],
             extra_terms=extra_terms,
             rho=rho,
             ignore_termination=ignore_termination,
             reduction=reduction,
         )
-        register_running_scale(self, scale_tau, kl_direction)
+        register_scale(self, "kl_scale", scale_tau)
         self.distill = distill
 
     def reset_parameters_recursive(self) -> None:

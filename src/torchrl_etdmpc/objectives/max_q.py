@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from torchrl_etdmpc.functional import gaussian_entropy, tanh_log_slope, two_hot_decode, updated_scale
+from torchrl_etdmpc.functional import gaussian_entropy, tanh_log_slope, two_hot_decode
 from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives.action_value import draw_two_heads
 from torchrl_etdmpc.objectives.latent_rollout import LatentRollout, head_rows, mean_of_head_rows
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss
+from torchrl_etdmpc.objectives.running_scale import moved_scale
 from torchrl_etdmpc.objectives.slices import Slices
 from torchrl_etdmpc.objectives.terms import Term, require_not_negative
 
@@ -81,16 +82,8 @@ def policy_value(
     return PolicyValue(value, entropy.sum(-1))
 
 
-def register_q_scale(loss: LatentRolloutLoss, scale_tau: float) -> None:
-    """Checks the rate and registers the running scale of the action values on the loss."""
-    if not 0 <= scale_tau <= 1:
-        raise ValueError(f"scale_tau must be in [0, 1], got {scale_tau}.")
-    loss.scale_tau = scale_tau
-    loss.register_buffer("q_scale", torch.ones_like(loss.rho))
-
-
 def max_q_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float, squashed_entropy: bool) -> Term:
-    """The term of the policy, for any loss with a running scale of action values.
+    """The term of the policy, for any loss with the running scale ``q_scale``.
 
     Raises:
         ValueError: if a coefficient is negative.
@@ -123,9 +116,7 @@ def _max_q(
         dropout=loss.training,
     )
     first = None if slices.counts is None else slices.counts[0]
-    if loss.training:
-        loss.q_scale.copy_(updated_scale(loss.q_scale, value[0], loss.scale_tau, first))
-    scale = loss.q_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
+    scale = moved_scale(loss, "q_scale", value[0], first)
     error = -value / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
     value, entropy = (mean_of_head_rows(rows, heads) for rows in (value, entropy))
     return mean_of_head_rows(error, heads), {"policy_value": value, "policy_entropy": entropy, "q_scale": scale}

@@ -8,7 +8,7 @@ from typing import NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl, updated_scale
+from torchrl_etdmpc.functional import gaussian_entropy, gaussian_kl
 from torchrl_etdmpc.modules import WorldModel
 from torchrl_etdmpc.objectives.latent_rollout import (
     LatentRollout,
@@ -17,6 +17,7 @@ from torchrl_etdmpc.objectives.latent_rollout import (
     mean_of_head_rows,
 )
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
+from torchrl_etdmpc.objectives.running_scale import moved_scale, register_scale
 from torchrl_etdmpc.objectives.slices import Slices
 from torchrl_etdmpc.objectives.terms import KLDirection, Term, require_not_negative
 
@@ -110,19 +111,9 @@ class EfficientTDMPCPolicyLoss(LatentRolloutLoss):
         rho: float = 0.5,
         reduction: Reduction | None = None,
     ) -> None:
-        term = policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef)
+        term = policy_term(self, policy_coef=policy_coef, entropy_coef=entropy_coef, kl_direction=kl_direction)
         super().__init__(world_model, [term], rho=rho, reduction=reduction)
-        register_running_scale(self, scale_tau, kl_direction)
-
-
-def register_running_scale(loss: LatentRolloutLoss, scale_tau: float, kl_direction: KLDirection) -> None:
-    """Checks the options of the distillation and registers its running scale on the loss."""
-    if not 0 <= scale_tau <= 1:
-        raise ValueError(f"scale_tau must be in [0, 1], got {scale_tau}.")
-    _check_direction(kl_direction)
-    loss.scale_tau = scale_tau
-    loss.kl_direction = kl_direction
-    loss.register_buffer("kl_scale", torch.ones_like(loss.rho))
+        register_scale(self, "kl_scale", scale_tau)
 
 
 def _check_direction(kl_direction: str) -> None:
@@ -130,13 +121,15 @@ def _check_direction(kl_direction: str) -> None:
         raise ValueError(f"kl_direction must be one of {', '.join(_DIRECTIONS)}, got {kl_direction!r}.")
 
 
-def policy_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float) -> Term:
-    """The term of the policy, for any loss with a running scale.
+def policy_term(loss: LatentRolloutLoss, *, policy_coef: float, entropy_coef: float, kl_direction: KLDirection) -> Term:
+    """The term of the policy, for any loss with the running scale ``kl_scale``.
 
     Raises:
-        ValueError: if a coefficient is negative.
+        ValueError: if a coefficient is negative, or the direction unknown.
     """
     require_not_negative(policy_coef=policy_coef, entropy_coef=entropy_coef)
+    _check_direction(kl_direction)
+    vars(loss).update(kl_direction=kl_direction)
     return Term(
         "policy",
         partial(_policy, loss),
@@ -164,10 +157,7 @@ def _policy(
     plan = head_rows(plan_loc, heads), head_rows(plan_scale, heads)
     kl, entropy = distillation(world_model, latent, *plan, kl_direction=loss.kl_direction)
     counts = planned if slices.counts is None else planned & slices.counts
-    # Departure from BMPC, which moves the scale in every policy step: an evaluation of the loss must not change it.
-    if loss.training:
-        loss.kl_scale.copy_(updated_scale(loss.kl_scale, kl[0], loss.scale_tau, counts[0]))
-    scale = loss.kl_scale.clone()  # the next call moves the buffer, perhaps before this one's backward pass
+    scale = moved_scale(loss, "kl_scale", kl[0], counts[0])
     error = kl / scale - loss.entropy_coef * slices.action.shape[-1] * entropy
     policy_kl, policy_entropy = (counted_mean(mean_of_head_rows(value, heads), counts) for value in (kl, entropy))
     metrics = {"policy_kl": policy_kl, "policy_entropy": policy_entropy, "kl_scale": scale}

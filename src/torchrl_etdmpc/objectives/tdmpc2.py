@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from torchrl_etdmpc.modules import ActionValueWorldModel
 from torchrl_etdmpc.objectives.action_value import action_value_term
 from torchrl_etdmpc.objectives.latent_rollout_loss import LatentRolloutLoss, Reduction
-from torchrl_etdmpc.objectives.max_q import max_q_term, register_q_scale
+from torchrl_etdmpc.objectives.max_q import max_q_term
+from torchrl_etdmpc.objectives.running_scale import register_scale
 from torchrl_etdmpc.objectives.terms import Term
 from torchrl_etdmpc.objectives.world_model import model_terms
 
@@ -91,7 +92,7 @@ class TDMPC2Loss(LatentRolloutLoss):
             ignore_termination=ignore_termination,
             reduction=reduction,
         )
-        register_q_scale(self, scale_tau)
+        register_scale(self, "q_scale", scale_tau)
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights for every network, made by no update yet; the targets become copies of the new ones."""
