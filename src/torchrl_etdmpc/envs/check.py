@@ -15,8 +15,6 @@ from torchrl_etdmpc.envs.layers import transforms_by_layer
 UNLIMITED = 1e10
 """MuJoCo's bound of an actuator that has none (mjMAXVAL)."""
 
-__all__ = ["check_env", "check_spaces"]
-
 
 def check_env(env: EnvBase, model: Any = None) -> None:
     """Checks that an environment has the entries that planners, collectors and losses expect.

@@ -20,8 +20,6 @@ from torchrl_etdmpc.envs.episode import RecordedEnv
 from torchrl_etdmpc.envs.random_states import pack_mt19937, unpack_mt19937
 from torchrl_etdmpc.envs.tasks import Maker, Task
 
-__all__ = ["RecordedDMControlEnv", "dmc_maker", "domain_and_task"]
-
 _INSTALL = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
 # The last dm_control release known to need MuJoCo 3.
 _LAST_FOR_MUJOCO_3 = (1, 0, 50)

@@ -20,8 +20,6 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl_etdmpc.envs.check import UNLIMITED
 from torchrl_etdmpc.envs.layers import simulator_of, transforms_of
 
-__all__ = ["RecordedEnv", "load_simulator_state", "simulator_state"]
-
 _TRANSFORMS = "transforms"
 """Where a state has what the transforms around the simulator remember, by their place."""
 _PAID = "episode_reward"

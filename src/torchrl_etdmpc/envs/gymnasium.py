@@ -20,8 +20,6 @@ from torchrl_etdmpc.envs.episode import RecordedEnv
 from torchrl_etdmpc.envs.random_states import pack_pcg64, unpack_pcg64
 from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM, Maker, Task
 
-__all__ = ["RecordedGymnasiumEnv", "gymnasium_maker"]
-
 
 class RecordedGymnasiumEnv(RecordedEnv, GymWrapper):
     """A :class:`~torchrl.envs.GymWrapper` that remembers how its episode came to be where it is.

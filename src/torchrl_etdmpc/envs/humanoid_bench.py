@@ -20,8 +20,6 @@ from torchrl_etdmpc.envs.gymnasium import RecordedGymnasiumEnv
 from torchrl_etdmpc.envs.random_states import pack_mt19937, unpack_mt19937
 from torchrl_etdmpc.envs.tasks import Maker, Task
 
-__all__ = ["MUJOCO", "RecordedHumanoidBenchEnv", "gymnasium_id", "humanoid_bench_maker"]
-
 MUJOCO = "3.1.6"
 """The release that HumanoidBench asks for; others simulate other dynamics, which shows at the first step."""
 _RECIPE = "make humanoidbench makes an environment that has it"

@@ -19,8 +19,6 @@ from torchrl_etdmpc.envs.layers import transforms_of, wrappers_of
 from torchrl_etdmpc.envs.tasks import Maker, Task, get_task, registered_maker
 from torchrl_etdmpc.envs.worker import make_in_worker, start_workers
 
-__all__ = ["find_maker", "make_env"]
-
 # Each says which function makes one environment of a task, or why it cannot be made on this machine.
 _SUITES: dict[str, Callable[[Task], Maker]] = {
     "dm_control": dmc_maker,

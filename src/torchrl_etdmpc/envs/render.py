@@ -14,8 +14,6 @@ from torchrl_etdmpc.envs.humanoid_bench import RecordedHumanoidBenchEnv
 from torchrl_etdmpc.envs.layers import simulator_of
 from torchrl_etdmpc.envs.tasks import INSTALL_GYMNASIUM
 
-__all__ = ["render_frame"]
-
 _DMC_SIZE = 384  # HumanoidBench, too
 # Camera 0 of the quadruped looks from straight above; 2 follows it from the side.
 _CAMERAS = {"quadruped": 2}

@@ -6,8 +6,6 @@ from torchrl_etdmpc.envs.gymnasium import gymnasium_success_return
 from torchrl_etdmpc.envs.humanoid_bench import humanoid_bench_success_return
 from torchrl_etdmpc.envs.tasks import Task, registered_maker, suite_task
 
-__all__ = ["success_return"]
-
 _SUITES = {"gymnasium": gymnasium_success_return, "humanoid_bench": humanoid_bench_success_return}
 
 

@@ -13,18 +13,6 @@ from typing import Any, Literal, Protocol
 import torch
 from torchrl.envs import EnvBase
 
-__all__ = [
-    "DMC_TASKS",
-    "EASY_DMC",
-    "HARD_DMC",
-    "HUMANOIDBENCH_HARD",
-    "Maker",
-    "Task",
-    "get_task",
-    "list_tasks",
-    "register_task",
-]
-
 
 @dataclass(frozen=True)
 class Task:

@@ -22,9 +22,6 @@ from torchrl_etdmpc.envs.layers import simulator_of, transforms_of, wrappers_of
 from torchrl_etdmpc.envs.make import find_maker
 from torchrl_etdmpc.envs.tasks import Maker, Task, of_own_code, register_task
 
-__all__ = ["import_attribute", "import_task"]
-
-
 _returned: dict[str, weakref.WeakSet[EnvBase]] = {}
 """By the path to a function, the simulators that it has returned."""
 _first_states: dict[str, dict[str, Any]] = {}
