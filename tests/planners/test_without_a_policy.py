@@ -83,6 +83,13 @@ def test_what_needs_a_policy_says_so():
             needy(Line())
 
 
+def test_proposals_that_are_asked_for_later_need_a_policy_too():
+    planner = make_planner(Line())
+    planner.num_proposals = 4
+    with pytest.raises(TypeError, match=r"^num_proposals=4 needs a model with a policy, got Line without"):
+        planner.plan(torch.zeros(1, 1))
+
+
 def test_an_activation_called_act_is_no_policy():
     model = Line()
     model.act = nn.Mish()

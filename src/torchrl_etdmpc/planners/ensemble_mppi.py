@@ -33,7 +33,7 @@ from torchrl_etdmpc.keys import (
     VALUE,
     VERSION,
 )
-from torchrl_etdmpc.modules.prediction import PredictionModel, has_action_values, has_policy
+from torchrl_etdmpc.modules.prediction import PredictionModel, has_action_values, has_policy, require_policy
 from torchrl_etdmpc.planners.arguments import (
     FirstAction,
     InitialPlan,
@@ -533,16 +533,18 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
 
     def _initial(self, latent: Tensor, start: Tensor) -> Gaussian:
         """The Gaussian ``[B, H, A]`` of the first candidates; ``start`` is the warm start."""
-        if self.initial == "wide" or not has_policy(self.world_model):
+        if self.initial == "wide":
             return Gaussian(start, torch.full_like(start, self.std_max))
-        mean, std = policy_gaussian(self.world_model, latent, self.horizon, self.proposal_log_std_bounds)
+        world_model = require_policy(self.world_model, "initial='policy'")
+        mean, std = policy_gaussian(world_model, latent, self.horizon, self.proposal_log_std_bounds)
         return Gaussian(mean, std.clamp(self.std_min, self.std_max))
 
     def _proposals(self, latent: Tensor, noise: Tensor) -> Tensor:
         """The policy's sequences ``[B, P, H, A]``."""
-        if not self.num_proposals or not has_policy(self.world_model):
-            return noise
-        return propose_sequences(self.world_model, latent, noise, self.proposal_log_std_bounds)
+        if not self.num_proposals:
+            return noise  # of no sequence
+        world_model = require_policy(self.world_model, f"num_proposals={self.num_proposals}")
+        return propose_sequences(world_model, latent, noise, self.proposal_log_std_bounds)
 
     def _target(self, latent: Tensor, found: Search, uniform: Tensor, explore: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Mean ``[B, A]``, standard deviation ``[B, A]`` and value ``[B]`` of the target.
