@@ -54,10 +54,9 @@ def bootstrapped_returns(
     terminated: Tensor | None = None,
     counts: Tensor | None = None,
 ) -> Tensor:
-    """What is paid in the rest of a slice, and what the state at its end is worth, from each of its steps on.
+    """The n-step return of every step of a slice to the slice's end, bootstrapped with the value of its last state.
 
-    ``G_k = r_k + gamma (1 - d_k) G_{k+1}``, with ``G_T = V(s_T)``: from step k on the n-step return of all the steps
-    that are left.
+    ``G_k = r_k + gamma (1 - d_k) G_{k+1}``, with ``G_T = V(s_T)``: n is the number of steps that are left at step k.
 
     Args:
         rewards (Tensor): of T steps, time first, shape ``[T, ...]``.

@@ -50,8 +50,8 @@ class RunningNorm(nn.Module):
 
         Args:
             rows (Tensor): ``[..., O]``.
-            counts (Tensor, optional): which rows count, bool, ``[...]``; a batch in which none does is none, and so is
-                one that holds a row which is not finite. Default: all of them.
+            counts (Tensor, optional): which rows count, bool, ``[...]``. The batch is left out if none counts, or if
+                one that counts is not finite. Default: all of them.
         """
         rate = 1 / (self.batches + 1).to(self.mean.dtype)
         mean, variance, moved = updated_moments(self.mean, self.variance, rows, rate, counts)

@@ -36,11 +36,12 @@ class EfficientTDMPCLoss(LatentRolloutLoss):
         value_coef (float): weight of the value targets, not negative. Default: 0.1.
         value_beta (float): pessimism of the value targets, the weight of the ensemble's standard deviation, not
             negative. Default: 0, the mean.
-        value_replayed (float): weight in the value targets of what was paid in the rest of the slice
-            (:func:`~torchrl_etdmpc.objectives.replayed_value_target`) beside what the model imagines, in [0, 1]. Not in
-            the thesis. Default: 0.
-        value_expectile (float): of the value targets, which the values learn, in (0, 1): above 0.5 what is above a
-            value counts more (:func:`~torchrl_etdmpc.objectives.value_error`). Not in the thesis. Default: 0.5.
+        value_replayed (float): weight of the n-step returns of replayed rewards in the value targets
+            (:func:`~torchrl_etdmpc.objectives.replayed_value_target`), in [0, 1]; imagined targets have the rest. Not
+            in the thesis. Default: 0.
+        value_expectile (float): which expectile of the value targets the values learn, in (0, 1); above 0.5, targets
+            above the value count more (:func:`~torchrl_etdmpc.objectives.value_error`). Not in the thesis. Default:
+            0.5, the mean.
         termination_coef (float): used with a termination head. Default: 1.
         policy_coef (float): weight of the distillation, not negative. Default: 1.
         entropy_coef (float): weight of the policy's entropy, not negative. Default: 1e-4.

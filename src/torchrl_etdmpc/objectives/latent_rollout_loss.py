@@ -72,10 +72,10 @@ class LatentRolloutLoss(SharedNetworksLoss):
     ``"shifted_valid"``, where the batch has them; or at the key ``loss.loss_mask_key``. A step counts if no step of its
     slice up to it is masked, since the rollout goes through all of them; means divide by the number of those.
 
-    Where a prioritised sampler has written ``priority_weight``, the mean is weighted by it, slice by slice, and the new
+    Where a prioritised sampler has written ``priority_weight``, the mean is weighted by it, slice by slice. The new
     priorities of the slices, the mean absolute errors of their values against the targets, are written into the batch
-    at ``td_error``, for ``buffer.update_tensordict_priority(batch[:, 0])``, which leaves the rows alone that no drawn
-    slice begins with: the only entry that a loss writes to its input.
+    at ``td_error``, the only entry that a loss writes to its input. ``buffer.update_tensordict_priority(batch[:, 0])``
+    gives them to the rows that the drawn slices begin with, and to no others.
     ``loss.use_prioritized_weights = False`` leaves the weights aside, not the priorities. A loss without values has no
     priority to offer.
 
@@ -339,7 +339,7 @@ class LatentRolloutLoss(SharedNetworksLoss):
 
     @property
     def _trains_the_encoder(self) -> bool:
-        """Not in evaluation, and not if it is frozen."""
+        """Whether this loss trains the encoder now: in training mode, unless all its parameters are frozen."""
         if not self.training or "encoder_params" not in self._modules:
             return False
         trained = [parameter.requires_grad for parameter in self.world_model.encoder.parameters()]

@@ -51,7 +51,7 @@ class SharedNetworksLoss(LossModule):
     target_policy_params: TensorDictParams
     _target_value: Any
     _trained: dict[str, tuple[Tensor | None, set[int]]]
-    """The first parameter of each network, and which all are, to see that no other has taken the place of one."""
+    """First parameter of each network, and the ids of all: by these a parameter that was replaced is noticed."""
 
     _attributes: ClassVar[dict[str, str]] = {
         "encoder": "encoder",

@@ -56,7 +56,7 @@ class Slices(NamedTuple):
 
 @dataclass(frozen=True)
 class SliceReader:
-    """How a batch of slices is read: for whom, for which networks, and where what else it may hold stands.
+    """How a batch of slices is read: by whom, for which networks, and at which keys it may hold more.
 
     >>> from torchrl_etdmpc.testing import random_slices
     >>> reader = SliceReader("MyLoss", WorldModel(3, 2, latent_dim=16, mlp_dim=32))
@@ -311,9 +311,9 @@ def _differ(entry: Any, other: Any) -> Tensor:
 
 
 class _Repeated:
-    """For steps ``[B, T]`` that do not count: the first of their slice, of a slice without one that counts another's.
+    """Stands in for entries of steps ``[B, T]`` that do not count: with the first step of their slice.
 
-    Zeros where nothing counts at all.
+    In a slice without a step that counts, with that of another slice; where nothing counts at all, with zeros.
     """
 
     def __init__(self, counts: Tensor) -> None:

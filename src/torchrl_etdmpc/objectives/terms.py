@@ -19,7 +19,7 @@ TermFunction = Callable[[WorldModel, Slices, LatentRollout], Tensor | tuple[Tens
 """A term of one's own: errors ``[T, B]``, or errors and metrics."""
 
 PRIORITY = "priority"
-"""Under which name among its metrics a term offers errors ``[T, B]`` to make priorities of, where there are weights."""
+"""Name, among a term's metrics, of the errors ``[T, B]`` that priorities are made of where the batch has weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,8 @@ class Term:
             error and a dictionary of metrics (``[T, B]``, of which the loss takes the mean, or scalars).
         coef (float): weight of the term.
         networks (tuple of str): networks of the world model that the loss trains because of it.
-        targets (tuple of str): those of them of which it reads a slowly following copy, ``rollout.targets[name]``.
+        targets (tuple of str): networks whose target network it reads, ``rollout.targets[name]``; some term trains
+            them.
         keys (tuple of NestedKey): what it reads beside observations and actions: names of fields of :class:`Slices`
             (``"reward"``, ``"terminated"``, ``"plan_loc"``, ``"plan_scale"``), or keys of the batch, which it finds in
             ``slices.extra``.

@@ -76,11 +76,11 @@ def replayed_value_target(
     terminated: Tensor | None = None,
     counts: Tensor | None = None,
 ) -> Tensor:
-    """TD target of what was done and paid in the rest of a slice: n-step returns of the behaviour.
+    """TD target of replayed rewards: the n-step return from every step to the end of its slice.
 
-    ``y_k = r_k + gamma r_{k+1} + ... + gamma^{T-k} mean_j Vbar_j(z_T)``. The model has no say in it, so it cannot keep
-    a value up that nothing pays for; what the planner does in a state is what the state is worth. It is the value of
-    the behaviour that is replayed, the present one's and those of before.
+    ``y_k = r_k + gamma r_{k+1} + ... + gamma^{T-k} mean_j Vbar_j(z_T)``. No predicted reward or latent enters, so
+    errors of the model cannot keep a value high. It is the value of the replayed behaviour, old and new, with no
+    correction for being off-policy.
 
     Args:
         target_values (callable): the target value heads, latents ``[..., L]`` to values ``[..., V]``.
@@ -177,8 +177,8 @@ class EfficientTDMPCValueLoss(LatentRolloutLoss):
             Default: 0, the mean.
         value_replayed (float): weight of :func:`replayed_value_target` beside :func:`imagined_value_target`, in
             [0, 1]. Default: 0.
-        value_expectile (float): of the targets, which the values learn, in (0, 1); see :func:`value_error`. Default:
-            0.5, their mean.
+        value_expectile (float): which expectile of the targets the values learn, in (0, 1); see :func:`value_error`.
+            Default: 0.5, their mean.
         rho (float): weight decay per step of the rollout, in (0, 1]. Default: 0.5.
         ignore_termination (bool): whether to accept rows that terminate although the world model has no termination
             head: values are then bootstrapped through the end of an episode. Otherwise such a row on the CPU is an

@@ -24,7 +24,7 @@ class PlanPrimer(TensorDictPrimer):
 
     Keyword Args:
         spaces (dict): arguments of :func:`~torchrl_etdmpc.envs.check_spaces`: what the planner's model takes.
-        latent_key (NestedKey, optional): an environment that offers this and no observation is planned in from its
+        latent_key (NestedKey, optional): an environment with this entry needs no observation: the planner reads its
             latents.
         **kwargs: those of :class:`torchrl.envs.TensorDictPrimer`.
     """
