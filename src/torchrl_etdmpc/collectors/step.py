@@ -186,7 +186,7 @@ class StepCollector(BaseCollector):
         if self._after_reset:
             self._check_finite(self._carrier, self._checked_before, "the environment")
         with set_exploration_type(self.exploration_type):
-            tensordict = self._act(self._carrier, self.in_seed_phase)
+            tensordict = self._decide(self._carrier)
         self._check_finite(tensordict, self.env.action_keys, "the policy")
         return tensordict
 
@@ -200,7 +200,7 @@ class StepCollector(BaseCollector):
         stepped, carrier = self._ask(self.env.step_and_maybe_reset, acted)
         self._check_finite(stepped, self._checked_after, "the environment")
         kept = stepped.exclude(*self.exclude_keys)
-        self._check_schema(kept, self.in_seed_phase)
+        self._check_schema(kept)
         self._store(kept, stepped.get(TRAJECTORY))
         self._frames += self.num_envs
         self._carrier = self._next_carrier(carrier, stepped)
@@ -232,9 +232,11 @@ class StepCollector(BaseCollector):
         if finite and self._schema.get(self.in_seed_phase) in (None, set(kept.keys(True, True))):
             self._store(kept, acted.get(TRAJECTORY))
 
-    def _act(self, tensordict: TensorDictBase, seeding: bool) -> TensorDictBase:
-        policy = self.seed_policy if seeding else self.policy
-        if self.policy_device is None or seeding:
+    def _decide(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.in_seed_phase:
+            return self.seed_policy(tensordict)
+        policy = self.policy
+        if self.policy_device is None:
             return policy(tensordict)
         inputs = tensordict.select(*policy.in_keys, strict=False).to(self.policy_device)
         outputs = policy(inputs).select(*policy.out_keys, strict=False).to(self.env.device or "cpu")
@@ -315,7 +317,8 @@ class StepCollector(BaseCollector):
                     "the step was not stored"
                 )
 
-    def _check_schema(self, kept: TensorDictBase, seeding: bool) -> None:
+    def _check_schema(self, kept: TensorDictBase) -> None:
+        seeding = self.in_seed_phase
         if seeding in self._schema:
             return
         self._schema[seeding] = keys = set(kept.keys(True, True))
