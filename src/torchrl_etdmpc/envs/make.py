@@ -128,7 +128,8 @@ def _make_one(make: Maker, task: Task, *, device: torch.device | str) -> EnvBase
         raise ValueError(f"task {task.name!r} must be a single environment, got batch size {list(env.batch_size)}.")
     moving = [(layer, "freeze() them") for layer in transforms_of(env) if _moves(layer)]
     moving += [(layer, "set update_running_mean = False") for layer in wrappers_of(env) if _moves(layer)]
-    for layer, remedy in moving:
+    if moving:
+        layer, remedy = moving[0]
         raise ValueError(
             f"task {task.name!r}: {type(layer).__name__} has statistics that move, other ones in every copy of the "
             f"environment, so training and evaluation would see different numbers; {remedy}, or leave it out and set "
