@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from torchrl_etdmpc.envs.check import check_spaces, model_sizes
+from torchrl_etdmpc.envs.check import model_sizes
 from torchrl_etdmpc.keys import ACTION, OBSERVATION
 from torchrl_etdmpc.modules import PolicyModel
 from torchrl_etdmpc.modules.prediction import require_policy
+from torchrl_etdmpc.planners.primer import check_part
 
 
 class BarePolicy(TensorDictModuleBase):
@@ -58,13 +57,8 @@ class BarePolicy(TensorDictModuleBase):
             alone (bool): whether this is the whole policy, so that what the environment lacks is a fault. Default:
                 ``True``.
         """
-        sizes: dict[str, Any] = model_sizes(self.world_model)
-        observation, action = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
-        if not alone and observation not in env.full_observation_spec.keys(True, True):
-            sizes["observation_dim"] = None
-        if not alone and action not in env.action_keys:
-            sizes["action_dim"] = None
-        check_spaces(env, **sizes, observation_key=observation, action_key=action)
+        keys = {"observation_key": self.in_keys[0], "action_key": self.out_keys[0]}
+        check_part(env, model_sizes(self.world_model) | keys, alone=alone)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

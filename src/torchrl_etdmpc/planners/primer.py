@@ -45,13 +45,7 @@ class PlanPrimer(TensorDictPrimer):
             alone (bool): whether the planner is the whole policy, so that what the environment lacks is a fault.
                 Default: ``True``.
         """
-        written = set(env.full_observation_spec.keys(True, True))
-        spaces = dict(self.spaces)
-        if unravel_key(spaces["observation_key"]) not in written and (self.latent_key in written or not alone):
-            spaces["observation_dim"] = None
-        if unravel_key(spaces["action_key"]) not in env.action_keys and not alone:
-            spaces["action_dim"] = None
-        check_spaces(env, **spaces)
+        check_part(env, self.spaces, alone=alone, latent_key=self.latent_key)
         self._check_resets(env)
 
     def _check_resets(self, env: EnvBase) -> None:
@@ -80,6 +74,28 @@ class PlanPrimer(TensorDictPrimer):
     def _specs(self) -> list[tuple[NestedKey, TensorSpec]]:
         primers: Any = self.primers  # its type says that there may be none
         return list(primers.items(True, True))
+
+
+def check_part(
+    env: EnvBase, spaces: dict[str, Any], *, alone: bool = True, latent_key: NestedKey | None = None
+) -> None:
+    """:func:`~torchrl_etdmpc.envs.check_spaces` of what acts, perhaps beside others that write what it reads.
+
+    Args:
+        env (EnvBase): the environment.
+        spaces (dict): arguments of ``check_spaces``, the keys among them.
+
+    Keyword Args:
+        alone (bool): whether it is the whole policy. Otherwise an observation or action that the environment does not
+            have is not compared. Default: ``True``.
+        latent_key (NestedKey, optional): where the environment has this entry, it needs no observation.
+    """
+    written, absent = set(env.full_observation_spec.keys(True, True)), {}
+    if unravel_key(spaces["observation_key"]) not in written and (latent_key in written or not alone):
+        absent["observation_dim"] = None
+    if unravel_key(spaces["action_key"]) not in env.action_keys and not alone:
+        absent["action_dim"] = None
+    check_spaces(env, **spaces | absent)
 
 
 def _path(key: NestedKey) -> tuple[Any, ...]:
