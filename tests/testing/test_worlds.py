@@ -97,9 +97,10 @@ def test_an_analytic_world_is_a_valid_latent_env(name):
     check_env_specs(LatentEnv(_WORLDS[name]()))
 
 
+@pytest.mark.parametrize("cast", [True, False])
 @pytest.mark.parametrize("name", _WORLDS)
-def test_a_world_follows_a_change_of_dtype(name):
-    world = _WORLDS[name]().double()
+def test_a_world_answers_in_the_dtype_of_its_input(name, cast):
+    world = _WORLDS[name]().double() if cast else _WORLDS[name]()
     state = torch.zeros(3, world.observation_dim, dtype=torch.float64)
     action = world.optimal_action(state)
     following = world.next(world.encode(state).unsqueeze(0), action)

@@ -295,7 +295,7 @@ class LQRWorld(AnalyticWorld):
 
     def optimal_action(self, state: Tensor) -> Tensor:
         """``-Kx``, clipped to [-1, 1]; the optimum where the clipping does nothing."""
-        return -(state @ self.gain.mT).clamp(-1, 1)
+        return -(state @ self.gain.to(state.dtype).mT).clamp(-1, 1)
 
 
 def _matrix(given: Tensor | None, default: Tensor | list) -> Tensor:
