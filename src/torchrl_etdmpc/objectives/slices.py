@@ -1,8 +1,7 @@
-"""Slices as replay hands them out, read into plain tensors: what a batch may look like, and what is refused."""
+"""Slices as replay hands them out, read into plain tensors: what a batch may look like."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,6 +12,13 @@ from torch import Tensor
 
 from torchrl_etdmpc.keys import DONE, NEXT
 from torchrl_etdmpc.modules import WorldModel
+from torchrl_etdmpc.objectives.slice_checks import (
+    refuse_gaps,
+    refuse_termination,
+    refuse_unknown_ends,
+    warn_of_holes,
+    warn_of_range,
+)
 
 _FEATURES = ("action", "reward", "terminated", "plan_loc", "plan_scale")
 OBSERVATION_FIELDS = ("observation", "next_observation")
@@ -100,8 +106,9 @@ class SliceReader:
         if 0 in entries["action"].shape[:2]:
             raise ValueError(f"{self.owner} needs at least one step, got {list(tensordict.batch_size)} slices.")
         counts = self._counted_steps(tensordict, entries["action"].shape[:2])
-        self._refuse_termination(tensordict, counts)
-        self._refuse_gaps(tensordict, counts, entries["action"].shape[:2])
+        if self.terminated_key is not None:
+            refuse_termination(tensordict, self.terminated_key, counts, self.owner)
+        refuse_gaps(tensordict, self.done_key, counts, entries["action"].shape[:2])
         if counts is not None:
             # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN. What
             # networks of the user's own read may be refused by them where it is zero, so they get what counts.
@@ -109,9 +116,9 @@ class SliceReader:
             harmless["plan_scale"] = torch.ones_like
             repeated = _Repeated(counts)
             entries = {name: _where(counts, entry, harmless.get(name, repeated)) for name, entry in entries.items()}
-        self._refuse_unknown_ends(tensordict, counts, entries, keys["next_observation"])
-        self._warn_of_range(entries["action"], keys["action"])
-        self._warn_of_holes(entries, counts, keys)
+        refuse_unknown_ends(tensordict, self.done_key, counts, entries, keys["next_observation"])
+        warn_of_range(entries["action"], keys["action"])
+        warn_of_holes(entries, counts, keys)
         entries = {name: entry.transpose(0, 1) for name, entry in entries.items()}
         fields: dict[str, Any] = {name: entries.pop(name, None) for name in FIELDS}
         fields["observation"] = fields["observation"][0]
@@ -195,119 +202,6 @@ class SliceReader:
             mask = mask.reshape(shape).bool()
             counts = mask if counts is None else counts & mask
         return None if counts is None else counts.int().cumprod(1) > 0
-
-    def _refuse_termination(self, tensordict: TensorDictBase, counts: Tensor | None) -> None:
-        if self.terminated_key is None or torch.compiler.is_compiling():
-            return
-        terminated = tensordict.get(self.terminated_key, None)
-        if terminated is None:
-            _refuse_elsewhere(tensordict, self.terminated_key, "terminated")
-        if terminated is None or terminated.device.type != "cpu":
-            return
-        if counts is not None:
-            terminated = terminated.reshape(counts.shape).bool() & counts
-        if terminated.any():
-            raise ValueError(
-                f"{self.terminated_key!r} holds True, but the world model has no termination head, so values would "
-                "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
-                f"{self.owner}(..., ignore_termination=True) if that is what you want."
-            )
-
-    def _refuse_gaps(self, tensordict: TensorDictBase, counts: Tensor | None, shape: torch.Size) -> None:
-        """Steps must follow each other, one at a time: what n-step returns and episodes side by side do not."""
-        if torch.compiler.is_compiling():
-            return
-        steps = tensordict.get("steps_to_next_obs", None)
-        if steps is not None and steps.device.type == "cpu" and (steps != 1).any():
-            raise ValueError(
-                "'steps_to_next_obs' is not 1 everywhere: these losses learn single steps, and n-step rewards and "
-                "observations would be taken for those of one; leave MultiStep out, value_replayed=... has n-step "
-                "targets."
-            )
-        done = tensordict.get(self.done_key, None)
-        if done is None:
-            _refuse_elsewhere(tensordict, self.done_key, "done")
-        if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
-            return
-        inside = done.reshape(shape)[:, :-1].bool()
-        if (inside if counts is None else inside & counts[:, 1:]).any():
-            raise ValueError(
-                f"{self.done_key!r} is True before the last step of a slice, so that another episode follows in it; "
-                "sample slices of one episode each (StepSliceSampler), or mask what follows (loss_mask_key)."
-            )
-
-    def _refuse_unknown_ends(
-        self, tensordict: TensorDictBase, counts: Tensor | None, entries: Mapping[NestedKey, Any], key: NestedKey
-    ) -> None:
-        """An episode's last observation, and a slice's, is learned like all others, so it must be there."""
-        if torch.compiler.is_compiling() or entries["action"].device.type != "cpu":
-            return
-        done, shape = tensordict.get(self.done_key, None), entries["action"].shape[:2]
-        ends = torch.zeros(shape, dtype=torch.bool, device="cpu")  # whatever the default device is
-        if done is not None and done.device.type == "cpu" and done.numel() == shape.numel():
-            ends |= done.reshape(shape).bool()
-        last = ends.clone()
-        last[:, -1] = True
-        for what, rows in ((f"where {self.done_key!r} is True", ends), ("at the last step of a slice", last)):
-            rows = rows if counts is None else rows & counts
-            if rows.any() and not _all_finite(entries["next_observation"], rows):
-                raise ValueError(
-                    f"{key!r} is not finite {what}: an environment with auto_reset=True has lost the last observations "
-                    "of its episodes, and compact_obs=True with NextStateReconstructor those of slices; collect "
-                    "without it, or mask these steps (loss_mask_key)."
-                )
-
-    def _warn_of_range(self, action: Tensor, key: NestedKey) -> None:
-        if not torch.compiler.is_compiling() and action.device.type == "cpu" and action.abs().max() > 1.001:
-            warnings.warn(
-                f"{key!r} leaves [-1, 1], where planner and policy look for actions; scale the data as ActionScaling "
-                "scales an environment's actions.",
-                stacklevel=4,
-            )
-
-    def _warn_of_holes(
-        self, entries: Mapping[NestedKey, Any], counts: Tensor | None, keys: Mapping[NestedKey, NestedKey]
-    ) -> None:
-        """What a step leads to is what the next one begins with, unless rows of other episodes or moments follow."""
-        action = entries["action"]
-        if torch.compiler.is_compiling() or action.device.type != "cpu" or action.shape[1] == 1:
-            return
-        apart = _differ(entries["observation"][:, 1:], entries["next_observation"][:, :-1])
-        if (apart if counts is None else apart & counts[:, 1:]).any():
-            warnings.warn(
-                f"{keys['next_observation']!r} of a step is not {keys['observation']!r} of the next: the slices join "
-                "rows of several episodes (sample with StepSliceSampler and unique ids), or rows are missing between "
-                "them. Where an augmentation makes the two differ, ignore this.",
-                stacklevel=4,
-            )
-
-
-def _refuse_elsewhere(tensordict: TensorDictBase, key: NestedKey, name: str) -> None:
-    """What is looked for under one key may stand under another, below ``"next"``, and would be taken to be missing."""
-    following = tensordict.get(NEXT, None)
-    if following is None:
-        return
-    others = [other for other in following.keys(True, True) if isinstance(other, tuple) and other[-1] == name]
-    if others:
-        raise ValueError(
-            f"{key!r} is not in the batch, but {(NEXT, *others[0])!r} is; name it: loss.set_keys({name}={others[0]!r})."
-        )
-
-
-def _all_finite(entry: Any, rows: Tensor) -> bool:
-    """Whether an entry ``[B, T, ...]``, or each of a dictionary, is finite in some rows ``[B, T]``."""
-    if is_tensor_collection(entry):
-        return all(_all_finite(value, rows) for value in entry.contiguous().values(True, True))
-    return not entry.is_floating_point() or bool(entry[rows].isfinite().all())
-
-
-def _differ(entry: Any, other: Any) -> Tensor:
-    """Where two entries ``[B, T, ...]``, or any of two dictionaries, are not the same, bool ``[B, T]``."""
-    if is_tensor_collection(entry):
-        keys = entry.keys(True, True)
-        return torch.stack([_differ(entry.get(key), other.get(key)) for key in keys]).any(0)
-    differ = (entry != other) & (entry == entry)  # what is not a number is another fault
-    return differ.reshape(*entry.shape[:2], -1).any(-1)
 
 
 class _Repeated:
