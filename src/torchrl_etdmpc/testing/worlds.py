@@ -6,8 +6,6 @@ score of one's own can be held against the optimum.
 
 from __future__ import annotations
 
-from abc import abstractmethod
-
 import torch
 from torch import Tensor, nn
 
@@ -72,22 +70,18 @@ class AnalyticWorld(nn.Module):
             self.register_buffer(name, error)
         self.register_buffer("version", torch.zeros((), dtype=torch.int64))
 
-    @abstractmethod
     def transition(self, latent: Tensor, action: Tensor) -> Tensor:
         """True next latent ``[..., L]`` of ``action [..., A]`` in ``latent [..., L]``."""
         raise NotImplementedError
 
-    @abstractmethod
     def reward(self, latent: Tensor, action: Tensor) -> Tensor:
         """Reward of ``action [..., A]`` in ``latent [..., L]``, shape ``[...]``."""
         raise NotImplementedError
 
-    @abstractmethod
     def value(self, latent: Tensor) -> Tensor:
         """True value of ``latent [..., L]``, shape ``[...]``."""
         raise NotImplementedError
 
-    @abstractmethod
     def optimal_action(self, state: Tensor) -> Tensor:
         """Best action ``[..., A]`` in ``state [..., O]`` (a latent will do)."""
         raise NotImplementedError
