@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_etdmpc import EfficientTDMPCLoss, EnsembleMPPIPlanner, LatentEnv, WorldModel
+from torchrl_etdmpc import ActionValueWorldModel, EfficientTDMPCLoss, EnsembleMPPIPlanner, LatentEnv, WorldModel
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.testing import LineWorld
 
@@ -175,3 +175,11 @@ def test_a_planner_whose_environment_gets_another_model_plans_with_that_one(scor
     for mine, theirs in zip(planner.plan(observation, noise=noise), other.plan(observation, noise=noise), strict=True):
         if isinstance(mine, torch.Tensor):
             torch.testing.assert_close(mine, theirs, rtol=0, atol=0)
+
+
+def test_what_is_drawn_fits_the_model_that_the_environment_has_now():
+    planner = make_planner()
+    for num_values in (3, 2):
+        planner.env = LatentEnv(ActionValueWorldModel(3, 1, latent_dim=16, mlp_dim=16, num_values=num_values))
+        assert planner.draw_noise(4).heads.shape[-1] == num_values
+        assert planner.plan(torch.randn(4, 3)).value.isfinite().all()

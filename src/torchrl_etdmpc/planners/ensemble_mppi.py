@@ -212,7 +212,6 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.next_plan_mean_key = unravel_key((NEXT, plan_mean_key))
         self.plan_keys = {name: unravel_key((plan_key, name)) for name in PLAN_FIELDS}
         self._warned_cold = False
-        self._num_action_values = env.world_model.num_values if has_action_values(env.world_model) else 0
         carried = [self.is_init_key, self.plan_mean_key] if warm_start else []
         written = [*self.plan_keys.values(), *([self.next_plan_mean_key] if warm_start else [])]
         # TorchRL's types know one key only.
@@ -437,15 +436,16 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
             "elite": torch.rand(*batch_size, self.num_elites, **single),
             "action": torch.randn(*batch_size, actions[-1], **options),
         }
-        if not self._num_action_values:
+        model = self.world_model
+        if not has_action_values(model):
             nothing = torch.zeros(*batch_size, 0, device=device, dtype=dtype)
             return PlanNoise(**drawn, bootstrap=nothing, heads=nothing)
         depths = self.horizon if self.score.depths == "all" else 1
-        scored = (self.iterations, self.num_samples, depths, self.world_model.num_dynamics, actions[-1])
+        scored = (self.iterations, self.num_samples, depths, model.num_dynamics, actions[-1])
         return PlanNoise(
             **drawn,
             bootstrap=torch.randn(*batch_size, *scored, **options),
-            heads=torch.rand(*batch_size, self.iterations, self._num_action_values, **options),
+            heads=torch.rand(*batch_size, self.iterations, model.num_values, **options),
         )
 
     @torch.no_grad()
