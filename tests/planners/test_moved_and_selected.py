@@ -172,6 +172,8 @@ def test_a_planner_whose_environment_gets_another_model_plans_with_that_one(scor
     noise = planner.draw_noise(4)
     planner.plan(observation, noise=noise)
     planner.env = other.env
+    assert [*map(id, planner.parameters())] == [*map(id, other.parameters())]
+    assert planner.state_dict().keys() == other.state_dict().keys()
     for mine, theirs in zip(planner.plan(observation, noise=noise), other.plan(observation, noise=noise), strict=True):
         if isinstance(mine, torch.Tensor):
             torch.testing.assert_close(mine, theirs, rtol=0, atol=0)

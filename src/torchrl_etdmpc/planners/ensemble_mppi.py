@@ -181,8 +181,6 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
                 f"initial must be 'wide' for a model without a policy ({type(env.world_model).__name__}), got 'policy'."
             )
         super().__init__(env, action_key=action_key)
-        del self._modules["env"]  # the base class registers it twice; the state dict should list the weights once
-        vars(self)["env"] = env
         self.horizon = horizon
         self.num_samples = num_samples
         self.num_elites = num_elites
@@ -218,6 +216,12 @@ class EnsembleMPPIPlanner(MPCPlannerBase):
         self.in_keys = [self.observation_key, *carried]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = [self.action_key, *written]  # pyright: ignore[reportAttributeAccessIssue]
         self._written = tuple(self.out_keys)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "env":  # the base class has it as its module, too; the state dict should list the weights once
+            vars(self)["env"] = value
+            name = "module"
+        super().__setattr__(name, value)
 
     @property
     def world_model(self) -> PredictionModel:
