@@ -10,6 +10,7 @@ import sys
 import time
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -111,6 +112,29 @@ def test_a_renderer_is_asked_for_only_where_something_may_be_rendered(monkeypatc
         monkeypatch.setenv("MUJOCO_GL", before)
     commands._choose_renderer(command, arguments)
     assert os.environ["MUJOCO_GL"] == after
+
+
+@pytest.mark.parametrize(
+    ("command", "before", "remedy"),
+    [
+        ("evaluate", None, "try MUJOCO_GL=osmesa, or leave the film out."),
+        ("evaluate", "osmesa", "try MUJOCO_GL=egl, or leave the film out."),
+        ("inspect_planner", "egl", "try MUJOCO_GL=osmesa, or MUJOCO_GL=disable to do without."),
+    ],
+)
+def test_a_renderer_that_fails_is_not_what_its_message_advises(monkeypatch, command, before, remedy):
+    def fail(name):
+        raise ImportError("no display")
+
+    if before is None:
+        monkeypatch.delenv("MUJOCO_GL", raising=False)
+    else:
+        monkeypatch.setenv("MUJOCO_GL", before)
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    monkeypatch.setattr(commands, "importlib", SimpleNamespace(import_module=fail))
+    monkeypatch.setattr(sys, "argv", ["command", "checkpoint=a.pt", "video=a.mp4"])
+    with pytest.raises(SystemExit, match=remedy):
+        commands.main(command)
 
 
 def start(*arguments: str, **variables: str) -> subprocess.Popen[str]:

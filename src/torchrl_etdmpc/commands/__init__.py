@@ -60,8 +60,9 @@ def main(command: str | None = None) -> None:
         backend = os.environ["MUJOCO_GL"]
         if backend == "disable" or os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
             raise
-        reason = " ".join(str(error).split())
-        sys.exit(f"error: cannot render with MUJOCO_GL={backend} ({reason}); try MUJOCO_GL=egl, or leave the film out.")
+        reason, other = " ".join(str(error).split()), "osmesa" if backend == "egl" else "egl"
+        without = "leave the film out" if command == "evaluate" else "MUJOCO_GL=disable to do without"
+        sys.exit(f"error: cannot render with MUJOCO_GL={backend} ({reason}); try MUJOCO_GL={other}, or {without}.")
     finally:
         if quiet:
             signal.signal(signal.SIGINT, handler)
