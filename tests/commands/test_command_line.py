@@ -10,7 +10,6 @@ pytest.importorskip("hydra")
 
 from torchrl_etdmpc.commands.command_line import as_typed, hydra_main  # noqa: E402
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig  # noqa: E402
-from torchrl_etdmpc.commands.train import CONFIG  # noqa: E402
 from torchrl_etdmpc.training import TrainConfig  # noqa: E402
 
 
@@ -24,7 +23,7 @@ def run_command(monkeypatch, capfd):
         received = []
         monkeypatch.setattr(sys, "argv", ["/bin/command", *arguments])
         try:
-            hydra_main(CONFIG, "train", config_class)(received.append)()
+            hydra_main("train", config_class)(received.append)()
         except SystemExit as stop:
             assert capfd.readouterr() == ("", "")
             assert "\n" not in stop.code

@@ -13,6 +13,7 @@ import tempfile
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from torchrl_etdmpc.commands.settings_help import Setting, groups_of, help_text, settings_of
@@ -20,6 +21,8 @@ from torchrl_etdmpc.envs import import_task, list_tasks
 from torchrl_etdmpc.runs import console, first_line
 from torchrl_etdmpc.runs.dotted import flat
 from torchrl_etdmpc.training import PRESETS, TASK_SETTINGS, TrainConfig, config_from_dict, follow_own_code, preset
+
+_CONFIG = str(Path(__file__).parent / "config")
 
 
 def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
@@ -63,7 +66,6 @@ def as_typed(text: str) -> str:
 
 
 def hydra_main(
-    config_path: str,
     config_name: str,
     config_class: type = TrainConfig,
     *,
@@ -75,8 +77,7 @@ def hydra_main(
     line of ``main``'s docstring is the first one of the help.
 
     Args:
-        config_path (str): absolute folder of the YAML files.
-        config_name (str): the file, without its ending.
+        config_name (str): a file of ``commands/config``, without its ending.
         config_class (type): dataclass that ``main`` receives, checked. Default: :class:`TrainConfig`.
 
     Keyword Args:
@@ -116,14 +117,14 @@ def hydra_main(
                 completed = plain if complete is None else complete(plain, explicit_settings())
                 return config_from_dict(config_class, completed)
 
-            @hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)
+            @hydra.main(version_base="1.3", config_path=_CONFIG, config_name=config_name)
             @one_line_errors  # inside as well: Hydra would add a line of its own to an exception that passes through it
             def run(values) -> None:
                 with console():
                     main(read(values))
 
             if _SWEEP_FLAGS & set(sys.argv):  # the last run's mistake is found before the first one begins
-                with hydra.initialize_config_dir(config_path, version_base="1.3"):
+                with hydra.initialize_config_dir(_CONFIG, version_base="1.3"):
                     for overrides in _runs_of_a_sweep(sys.argv[1:]):
                         _ = read(hydra.compose(config_name, overrides)).task_spec
             with _without_traces_of_a_sweep():

@@ -13,7 +13,6 @@ from torchrl.envs import EnvBase, SerialEnv
 from torchrl_etdmpc.collectors import Episodes, evaluate
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
-from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, env_sizes, make_env, render_frame, success_return
 from torchrl_etdmpc.envs.layers import simulator_of
 from torchrl_etdmpc.envs.seeding import seed_everything
@@ -57,7 +56,7 @@ class EvaluateConfig(PlannerCommandConfig):
             raise ValueError(f"csv must end in .csv, got {self.csv!r}.")
 
 
-@hydra_main(CONFIG, "evaluate", EvaluateConfig, complete=with_the_agent_s_planner)
+@hydra_main("evaluate", EvaluateConfig, complete=with_the_agent_s_planner)
 def main(config: EvaluateConfig) -> None:
     """Plays episodes with a trained agent, and films the first one if asked to."""
     if config.policy == "bare" and config.changed:

@@ -9,7 +9,6 @@ import torch
 
 from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
-from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.planners import export_planner, export_policy
 from torchrl_etdmpc.runs import replacing
 from torchrl_etdmpc.runs.files import make_folder
@@ -29,7 +28,7 @@ class ExportConfig(AgentCommandConfig):
             raise ValueError(f"batch_size must be at least 1, got {self.batch_size}.")
 
 
-@hydra_main(CONFIG, "export", ExportConfig)
+@hydra_main("export", ExportConfig)
 def main(config: ExportConfig) -> None:
     """Writes an agent's policy and planner as programs that run where only PyTorch is installed."""
     out = Path(config.out).expanduser()

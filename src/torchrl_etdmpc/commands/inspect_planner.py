@@ -15,7 +15,6 @@ from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.commands import begin_without_renderer, renderer_is_a_guess
 from torchrl_etdmpc.commands.agent_command import PlannerCommandConfig, with_the_agent_s_planner
 from torchrl_etdmpc.commands.command_line import hydra_main
-from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import Task, env_sizes, make_env
 from torchrl_etdmpc.inspector.inspection import Inspection, State
 from torchrl_etdmpc.inspector.page import make_page, serve
@@ -59,7 +58,7 @@ class InspectConfig(PlannerCommandConfig):
             raise ValueError(f"seed must be in [0, 2**31 - 1], got {self.seed}.")
 
 
-@hydra_main(CONFIG, "inspect_planner", InspectConfig, complete=with_the_agent_s_planner)
+@hydra_main("inspect_planner", InspectConfig, complete=with_the_agent_s_planner)
 def main(config: InspectConfig) -> None:
     """Shows what the planner of a trained agent sees: candidates, heads and depths of any state, on a local page."""
     plotly_script()  # what is not installed is said before anything takes long

@@ -20,7 +20,6 @@ import torch
 
 from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
-from torchrl_etdmpc.commands.train import CONFIG
 from torchrl_etdmpc.envs import env_sizes, make_env
 from torchrl_etdmpc.inspector import Episode, Simulator, play_episode
 from torchrl_etdmpc.inspector.studies import choose_states
@@ -74,7 +73,7 @@ def main() -> None:
     _main()
 
 
-@hydra_main(CONFIG, "study", StudyConfig)
+@hydra_main("study", StudyConfig)
 def _main(config: StudyConfig) -> None:
     """Measures what a trained planner believes, and what is true of it."""
     if importlib.util.find_spec("matplotlib") is None:

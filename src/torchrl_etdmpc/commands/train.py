@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 from torchrl_etdmpc.commands.command_line import as_typed, explicit_settings, hydra_main
 from torchrl_etdmpc.training import (
@@ -14,10 +13,8 @@ from torchrl_etdmpc.training import (
     with_stored_settings,
 )
 
-CONFIG = str(Path(__file__).parent / "config")
 
-
-@hydra_main(CONFIG, "train", complete=with_stored_settings)
+@hydra_main("train", complete=with_stored_settings)
 def main(config: TrainConfig) -> None:
     """Trains EfficientTDMPC on any task: DMC's, Gymnasium's, or an environment of your own."""
     train(config)
