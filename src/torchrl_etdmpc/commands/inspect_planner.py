@@ -62,22 +62,20 @@ class InspectConfig(PlannerCommandConfig):
 def main(config: InspectConfig) -> None:
     """Shows what the planner of a trained agent sees: candidates, heads and depths of any state, on a local page."""
     plotly_script()  # what is not installed is said before anything takes long
-    if config.save is not None:
-        free_folder(config.save)
+    folder = None if config.save is None else free_folder(config.save)
     inspection = _inspection(config)
-    folder = None if config.save is None else Path(config.save).expanduser()
     made = folder is not None and not folder.exists()
     try:
-        if config.save is not None:
-            make_folder(free_folder(config.save))
+        if folder is not None:
+            make_folder(folder)
         state = _state(config, inspection)
-        if config.save is None:
+        if folder is None:
             app = make_page(inspection, state=state, seed=config.seed, allow_remote=config.allow_remote)
             serve(app, host=config.host, port=config.port, allow_remote=config.allow_remote, ready=_say_where)
         else:
             trace = inspection.plan(state, {}, seed=config.seed)
             strip = None if state.replay else inspection.strip(state.episode)
-            page = write_page(config.save, trace, strip=strip, step=state.step)
+            page = write_page(folder, trace, strip=strip, step=state.step)
             print(f"{inspection.task.name if inspection.task else 'agent'}: {page}, which any browser opens")
     except BaseException:
         if made and folder is not None:
