@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -215,6 +216,22 @@ def test_an_address_where_nobody_answers_is_named_at_once(small, tmp_path):
             run_on_ray(queue, address=address)
         assert "\n" not in str(error.value)
         assert time.monotonic() - tick < 5
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        (None, "a local Ray cluster cannot be started (no memory); take another engine."),
+        ("auto", "address=auto is no cluster (no memory); leave address out for one of this machine, or take another "),
+    ],
+)
+def test_what_cannot_be_started_advises_something_else(monkeypatch, address, message):
+    def fail(**options):
+        raise RuntimeError("no memory.")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=fail, shutdown=lambda: None))
+    with pytest.raises(OSError, match=re.escape(message)):
+        run_on_ray(RunQueue([]), address=address)
 
 
 # -- a real cluster ---------------------------------------------------------------------------------------------------

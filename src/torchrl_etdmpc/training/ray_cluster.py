@@ -36,14 +36,16 @@ class RayCluster:
     """A connection to a Ray cluster: one of its own on this machine, or the one at an address.
 
     Args:
-        address (str, optional): ``host:port``, ``ray://host:port`` or ``auto``. Default: a cluster of this machine that
-            lives as long as the connection.
+        address (str, optional): ``host:port``, ``ray://host:port`` or ``auto``; ``None`` is a cluster of this machine
+            that lives as long as the connection.
+
+    Keyword Args:
         workers (int): CPUs that are needed.
 
     Raises:
         ImportError: if Ray is missing.
-        OSError: if nothing answers at the address.
-        ValueError: if the cluster has fewer CPUs than workers.
+        OSError: if nothing answers at the address, or a cluster of this machine cannot be started.
+        ValueError: if the address has another form, or the cluster has fewer CPUs than workers.
     """
 
     def __init__(self, address: str | None, *, workers: int) -> None:
@@ -53,22 +55,26 @@ class RayCluster:
         except ImportError as error:
             raise ImportError("engine=ray needs Ray, which is missing; run: pip install 'ray>=2.60,<3'") from error
         self._folder: str | None = None
-        quiet: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
         if address is None:
             self._folder = tempfile.mkdtemp(prefix="ray")  # sockets lie in it, whose names must be short
-            quiet |= {"num_cpus": workers, "object_store_memory": _OBJECT_STORE_BYTES, "_temp_dir": self._folder}
+            options |= {"num_cpus": workers, "object_store_memory": _OBJECT_STORE_BYTES, "_temp_dir": self._folder}
+            options["include_dashboard"] = False
         else:
             _require_reachable(address)
-            quiet = {"address": address, "log_to_driver": False, "logging_level": "error"}
+            options["address"] = address
         try:
             with _same_signals(), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of what later versions will do
-                ray.init(**quiet)
+                ray.init(**options)
         except Exception as error:
             self.close()
-            where = "a local Ray cluster cannot be started" if address is None else f"address={address} is no cluster"
+            reason = first_line(error).rstrip(".")
+            if address is None:
+                raise OSError(f"a local Ray cluster cannot be started ({reason}); take another engine.") from error
             raise OSError(
-                f"{where} ({first_line(error).rstrip('.')}); leave address out for one, or another engine."
+                f"address={address} is no cluster ({reason}); leave address out for one of this machine, or take "
+                "another engine."
             ) from error
         there = int(ray.cluster_resources().get("CPU", 0))
         if there < workers:
