@@ -83,21 +83,21 @@ def make_folder(folder: Path) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file; name a folder.")
-    _require_space(folder, folder)
+    _require_writable(folder, folder)
 
 
 def make_folder_of(file: Path) -> None:
-    """The same for a file to be written: makes its folder.
+    """Makes the folder of a file to be written, or says before any work is done that it cannot be.
 
     Raises:
-        ValueError: if it cannot be written.
+        ValueError: if it cannot.
     """
     if file.is_dir():
         raise ValueError(f"{file} is a folder; name a file.")
-    _require_space(file.parent, file)
+    _require_writable(file.parent, file)
 
 
-def _require_space(folder: Path, target: Path) -> None:
+def _require_writable(folder: Path, target: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):  # the one way to know, for every user and file system
