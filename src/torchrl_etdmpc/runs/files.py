@@ -194,13 +194,12 @@ def load_tensors(data: bytes, path: Path) -> Any:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > len(data):  # torch.save compresses nothing
-                raise DamagedFileError(f"{path} is compressed, which no file of torch.save is; it was not loaded.")
-            damaged = archive.testzip()
+            compressed = sum(entry.file_size for entry in archive.infolist()) > len(data)
+            damaged = None if compressed else archive.testzip()  # which unpacks everything
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, EOFError) as error:
-        if isinstance(error, DamagedFileError):
-            raise
         raise DamagedFileError(f"{path} is not a file of torch.save: cut off, damaged or another kind.") from error
+    if compressed:
+        raise DamagedFileError(f"{path} is compressed, which no file of torch.save is; it was not loaded.")
     if damaged is not None:
         raise DamagedFileError(f"{path} is damaged: the checksum of {damaged} in it is wrong.")
     try:
