@@ -277,7 +277,7 @@ class CheckpointStore:
         for folder in folders[-self.keep :]:
             try:
                 kept.append(_read_manifest(folder)["replay"])
-            except (CheckpointError, KeyError):
+            except CheckpointError:
                 return  # better too many files than too few
         self.journal.prune(kept)
 
