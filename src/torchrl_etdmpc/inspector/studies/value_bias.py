@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_etdmpc.functional import bootstrapped_returns
 from torchrl_etdmpc.inspector.episodes import Episode
 from torchrl_etdmpc.inspector.studies.replan import generator_of, replan, values
 from torchrl_etdmpc.inspector.studies.states import States, episode_interval
@@ -59,11 +60,8 @@ def value_bias(
 
 def _returns_to_go(planner: EnsembleMPPIPlanner, episode: Episode) -> tuple[Tensor, Tensor]:
     """Of every decision: the discounted rest, and the weight of the last value in it, both ``[T]``."""
-    rest = torch.zeros(()) if episode.terminated else values(planner, episode.observation[-1])
-    returns = torch.empty_like(episode.reward)
-    for step in range(len(returns) - 1, -1, -1):
-        rest = episode.reward[step] + planner.discount * rest
-        returns[step] = rest
+    end = torch.zeros(()) if episode.terminated else values(planner, episode.observation[-1])
+    returns = bootstrapped_returns(episode.reward, end.expand_as(episode.reward), planner.discount)
     left = torch.arange(len(returns), 0, -1)
     share = planner.discount**left * (0.0 if episode.terminated else 1.0)
     return returns, share
