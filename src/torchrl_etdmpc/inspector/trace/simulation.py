@@ -38,16 +38,10 @@ def add_simulation(
     arrays = {**trace.arrays, "real_rewards": as_array(rewards)}
     if trace.get("basis") is not None:
         with torch.no_grad():
-            like = _like(model)
+            device, dtype = device_and_dtype(model)
             floating = observations.is_floating_point()  # others an encoder is given as they are
-            latents = as_array(model.encode(observations.to(like if floating else like.device)))
+            latents = as_array(model.encode(observations.to(device, dtype if floating else None)))
         arrays["real_points"] = ((latents - trace["centre"]) @ trace["basis"].T).astype(np.float32)
     if frames is not None:
         arrays["frames"] = as_array(frames)
     return replace(trace, arrays=arrays)
-
-
-def _like(model: PredictionModel) -> Tensor:
-    """A tensor where the model is."""
-    device, dtype = device_and_dtype(model)
-    return torch.empty(0, device=device, dtype=dtype)

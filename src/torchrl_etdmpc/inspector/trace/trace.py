@@ -149,7 +149,8 @@ class Trace:
             raise TraceError(
                 f"a trace needs the array {missing[0]!r}, which is missing; it has {', '.join(self.arrays)}."
             )
-        sizes: dict[str, int] = {"C": min(COMPONENTS, self._size("centre", 0, COMPONENTS))}
+        centre = self.get("centre")
+        sizes: dict[str, int] = {"C": COMPONENTS if centre is None or not centre.ndim else min(COMPONENTS, len(centre))}
         for name, array in self.arrays.items():
             if name not in _DIMENSIONS:
                 raise TraceError(f"a trace has no array {name!r}; remove it or use the version that wrote it.")
@@ -171,10 +172,6 @@ class Trace:
                 raise TraceError(f"{name} of a trace must be whole numbers in [{least}, {most}], its candidates.")
         if self["proposals"].dtype.kind != "b":
             raise TraceError(f"proposals of a trace must be true or false, got {self['proposals'].dtype}.")
-
-    def _size(self, name: str, dimension: int, default: int) -> int:
-        array = self.arrays.get(name)
-        return default if array is None or array.ndim <= dimension else array.shape[dimension]
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.arrays[name]
@@ -201,9 +198,9 @@ class Trace:
     @property
     def num_dynamics(self) -> int:
         """F, as far as it is known; else 1."""
-        for name, dimension in (("points", 3), ("returns", 3)):
+        for name in ("points", "returns"):
             if self.get(name) is not None:
-                return self[name].shape[dimension]
+                return self[name].shape[3]
         return 1
 
     def save(self, path: str | Path) -> Path:
