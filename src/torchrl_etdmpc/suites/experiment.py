@@ -270,8 +270,10 @@ class Experiment:
         return runs
 
 
-def read_experiment(file: Path, **changes: Any) -> Experiment:
-    """An experiment from its file; ``changes`` take the place of what the file says.
+def read_experiment(
+    file: Path, *, tasks: Any = None, seeds: Any = None, settings: Mapping[str, Any] | None = None
+) -> Experiment:
+    """An experiment from its file.
 
     .. code-block:: yaml
 
@@ -293,8 +295,11 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
 
     Args:
         file (Path): YAML as above.
-        **changes: ``tasks`` and ``seeds`` in the same forms; ``settings`` are added to the file's and to every
-            variant's, whose own they replace.
+
+    Keyword Args:
+        tasks (str or list of str, optional): instead of the file's.
+        seeds (int or list of int, optional): instead of the file's.
+        settings (mapping, optional): added to the file's and to every variant's, whose own they replace.
 
     Raises:
         ValueError: if the file cannot be read, or says what it may not. It may hold the path of a task or a score of
@@ -320,7 +325,7 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
         values.get("budget", "benchmark") == "benchmark" or "total_env_steps" not in shared,
         f"{file} says budget and, in its settings, total_env_steps, which are the same; leave one out.",
     )
-    more = _spelled(changes.get("settings") or {})
+    more = _spelled(settings or {})
     budget: Any = more.get("total_env_steps", shared.pop("total_env_steps", values.get("budget", "benchmark")))
     budget = int(budget) if isinstance(budget, float) and budget.is_integer() else budget
     _require(
@@ -331,10 +336,8 @@ def read_experiment(file: Path, **changes: Any) -> Experiment:
     more.pop("total_env_steps", None)
     return Experiment(
         name=file.stem,
-        tasks=_tasks(values.get("tasks") if changes.get("tasks") is None else changes["tasks"], file),
-        seeds=_seeds(values.get("seeds"), file)
-        if changes.get("seeds") is None
-        else _seeds(changes["seeds"], "this call"),
+        tasks=_tasks(values.get("tasks") if tasks is None else tasks, file),
+        seeds=_seeds(values.get("seeds"), file) if seeds is None else _seeds(seeds, "this call"),
         variants=variants,
         searches=searches,
         settings=shared | more,
