@@ -480,7 +480,7 @@ def _check_types(config: Any, prefix: str = "") -> None:
 
 
 def _convert(hint: Any, value: Any, name: str) -> Any:
-    if name in OWN_CODE and isinstance(value, str) and (":" in value or not _choices(hint)):
+    if name in OWN_CODE and isinstance(value, str) and (":" in value or not _has_choices(hint)):
         own_code(OWN_CODE[name], value)
         return value
     if typing.get_origin(hint) in (types.UnionType, typing.Union):  # the latter with a Literal in it
@@ -505,7 +505,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
     return value
 
 
-def _choices(hint: Any) -> bool:
+def _has_choices(hint: Any) -> bool:
     return any(typing.get_origin(option) is Literal for option in typing.get_args(hint))
 
 
