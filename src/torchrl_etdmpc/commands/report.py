@@ -160,8 +160,7 @@ def choose_budget(
     """The budget and the step of the AUC's grid: what was asked for or planned, the benchmark's, or what all reach."""
     from torchrl_etdmpc.analysis import BENCHMARKS, begins
 
-    last = ends(runs)
-    reached = int(last.min())
+    least, most = reached(runs), ends(runs).max()
     present = set(runs["task"])
     planned = {
         plan.env_steps(task, variant)
@@ -170,15 +169,15 @@ def choose_budget(
         for variant in plan.variants
         if task in present
     }
-    planned = {budget for budget in planned if budget and budget <= last.max()}
+    planned = {budget for budget in planned if budget and budget <= most}
     step = None
-    if arguments.budget or (reached >= benchmark.budget and benchmark.name in BENCHMARKS):
+    if arguments.budget or (least >= benchmark.budget and benchmark.name in BENCHMARKS):
         budget = arguments.budget or benchmark.budget
         step = DEFAULT_GRID_STEP if budget >= 2 * DEFAULT_GRID_STEP and budget % DEFAULT_GRID_STEP == 0 else None
     elif len(planned) == 1:  # a run that ended early is named, and does not shorten the others
         (budget,) = planned
     else:
-        budget = min(reached, benchmark.budget)
+        budget = min(least, benchmark.budget)
     step = arguments.grid_step or step
     if step and budget // step > MOST_POINTS:
         raise ValueError(
