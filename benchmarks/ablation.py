@@ -76,9 +76,9 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
     rows, alone = [], []
     for path in sorted(folder.glob("*/*/seed*")):
         variant, task, seed = path.parts[-3:]
-        beside = partner(folder, base, task, seed)
         if variant == base:
             continue
+        beside = partner(folder, base, task, seed)
         if beside is None:
             alone.append(f"{variant}/{task}/{seed}")
             continue

@@ -80,12 +80,7 @@ def exercise(task: str, preset_name: str, device: torch.device) -> dict[str, obj
     collector = build_collector(config, agent, env, replay)
     reanalyze.enabled = False
     terminations = sum(int(collector.step()["next", "terminated"].sum()) for _ in range(decisions))
-
-    def update(*, distill: bool):
-        batch = replay.sample().to(device)
-        return agent.updater.step(batch, distill=distill)
-
-    update(distill=False)  # pretraining
+    agent.updater.step(replay.sample().to(device), distill=False)  # pretraining
     _, plan_s = timed(device, collector.step)
     batch, reanalyze_s = timed(device, lambda: reanalyze.refresh(replay.sample()))
     metrics, update_s = timed(device, lambda: agent.updater.step(batch.to(device), distill=True))

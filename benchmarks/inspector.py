@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ctypes.util import find_library
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -134,8 +135,6 @@ def measured(name: str, repeats: int) -> dict[str, Any]:
 
 def untrained(preset_name: str, changes: dict[str, int]) -> Any:
     """The preset's planner, over networks whose scores differ: new ones find every candidate equally good."""
-    from dataclasses import replace
-
     config = replace(preset(preset_name), task=TASK, compile="off")
     config = replace(config, planner=replace(config.planner, **changes))
     torch.manual_seed(0)

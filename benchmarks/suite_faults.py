@@ -69,12 +69,11 @@ def write_experiment(file: Path, budget: int, **changes: Any) -> Experiment:
 
 
 def start_suite(file: Path, runs_dir: Path, *more: str) -> subprocess.Popen:
-    words = ["suite.py", f"experiment={file}", f"runs_dir={runs_dir}", "workers=2", "retries=1", *more]
-    log = open(runs_dir.with_suffix(".log"), "ab")  # noqa: SIM115
+    command = [sys.executable, str(ROOT / "examples" / "suite.py"), f"experiment={file}", f"runs_dir={runs_dir}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "src")}
-    with log:
+    with open(runs_dir.with_suffix(".log"), "ab") as log:
         return subprocess.Popen(
-            [sys.executable, str(ROOT / "examples" / words[0]), *words[1:]],
+            [*command, "workers=2", "retries=1", *more],
             env=environment,
             stdout=log,
             stderr=subprocess.STDOUT,
