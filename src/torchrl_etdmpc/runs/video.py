@@ -43,17 +43,17 @@ def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathL
     if not fps > 0:
         raise ValueError(f"fps must be above 0, got {fps}; 30 is usual.")
     Image = film_writer(path)
-    kept, shape = [], None
+    kept, shape, every = [], None, max(round(fps / _GIF_FPS), 1)
     for index, frame in enumerate(frames):
         array = _check_frame(frame, index, shape)
         shape = array.shape
-        if not index % max(round(fps / _GIF_FPS), 1):
+        if index % every == 0:
             kept.append(Image.fromarray(np.ascontiguousarray(array)))
     if not kept:
         raise ValueError("frames must hold at least one frame, got none; record an episode first.")
     palette = kept[0].quantize(_GIF_COLOURS)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept]
-    milliseconds = 10 * round(100 * max(round(fps / _GIF_FPS), 1) / fps)
+    milliseconds = 10 * round(100 * every / fps)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
