@@ -351,10 +351,7 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
         raise ValueError(f"{file} has neither the columns seed, return_mean (one row per seed) nor mean; add them.")
     _numbers(table, numbers, file)
     _check_units(table, file)
-    double = table[table.duplicated(key)]
-    if len(double):
-        row = double.iloc[0]
-        raise ValueError(f"{file} has two rows for {', '.join(f'{name}={row[name]}' for name in key)}; keep one.")
+    _refuse_doubles(table, key, file)
     return table[list(columns)].sort_values(key, ignore_index=True)
 
 
@@ -384,13 +381,7 @@ def read_points(file: str | os.PathLike[str]) -> pd.DataFrame:
     wrong = table["source"].isna() | table["mean"].isna() | (table["env_steps"] == 0)
     if wrong.any():
         raise ValueError(f"{file}: every point needs a source, a mean and env_steps above 0.")
-    double = table[table.duplicated(["method", "task", "env_steps"])]
-    if len(double):
-        row = double.iloc[0]
-        raise ValueError(
-            f"{file} has two rows for method={row['method']}, task={row['task']}, env_steps={row['env_steps']:g}; "
-            "keep one."
-        )
+    _refuse_doubles(table, ["method", "task", "env_steps"], file)
     return table[list(POINT_COLUMNS)]
 
 
@@ -443,6 +434,14 @@ def _parse(text: str, file: Path, columns: tuple[str, ...], *, empty: bool = Fal
             raise ValueError(f"{file}: every row needs a {name}.")
     _numbers(table, [name for name in ("env_steps", "return_mean") if name in columns], file)
     return table
+
+
+def _refuse_doubles(table: pd.DataFrame, key: list[str], file: Path) -> None:
+    """Raises ValueError if two rows are of the same curve and step, or point."""
+    double = table[table.duplicated(key)]
+    if len(double):
+        row = double.astype({"env_steps": int}).iloc[0]
+        raise ValueError(f"{file} has two rows for {', '.join(f'{name}={row[name]}' for name in key)}; keep one.")
 
 
 def _numbers(table: pd.DataFrame, columns: list[str], file: Path) -> None:
