@@ -62,14 +62,11 @@ def serve(
         server = make_server(host, number, app.server, threaded=True, request_handler=Quiet, fd=listening.fileno())
         try:
             if ready is not None:
-                ready(f"http://{f'[{host}]' if ':' in host else host}:{number}/", _stopper(server))
+                address = f"http://{f'[{host}]' if ':' in host else host}:{number}/"
+                ready(address, lambda: threading.Thread(target=server.shutdown).start())
             server.serve_forever()
         finally:
             server.server_close()
-
-
-def _stopper(server: Any) -> Callable[[], None]:
-    return lambda: threading.Thread(target=server.shutdown).start()
 
 
 def answer_this_machine_only(server: Any) -> None:
