@@ -21,7 +21,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def console() -> Iterator[None]:
     """For its duration, TorchRL's log and Python's warnings become lines such as ``12:03:05 compiled in 90 s``.
 
-    No colours, no places in the source; notices of other libraries, of which a user can make nothing, are left out.
+    Without colours and places in the source. Of other libraries' logs only warnings and errors are shown.
 
     >>> with console():
     ...     torchrl_logger.info("compiled in 90 s")  # doctest: +SKIP

@@ -40,7 +40,7 @@ class Retries:
     """How often a run is tried again: without limit while it gets further, ``most`` times without.
 
     Args:
-        most (int): tries after one that did not get further than those before it.
+        most (int): retries in a row that may end without getting further.
     """
 
     def __init__(self, most: int) -> None:

@@ -126,7 +126,7 @@ class BestAgent:
         return {"return_mean": self.return_mean, "file": content}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores :meth:`state_dict`, and the file if it holds something else by now."""
+        """Restores :meth:`state_dict`, and writes the file anew."""
         self.return_mean, self._content = state_dict["return_mean"], state_dict["file"].numpy().tobytes()
         self._written = not self._content
         self.write()

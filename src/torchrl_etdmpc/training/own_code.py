@@ -24,7 +24,7 @@ _followed: dict[tuple[str, str], Callable[..., Any]] = {}
 
 
 def follow_own_code(name: str, value: str) -> None:
-    """Imports the code that a command line names, if this setting does; nothing else may call this.
+    """Imports the code that a command line names, if this setting does; not to be called with what a file holds.
 
     Args:
         name (str): the setting, as it was typed.
