@@ -45,8 +45,8 @@ _ACTION_REPEAT = {task: benchmark.action_repeat for benchmark in BENCHMARKS.valu
 def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     """The run directories in or below the paths: those that hold an ``eval.csv``.
 
-    What should hold one is among them, a folder with a ``train.csv`` or a ``summary.json``: who reads it learns that it
-    does not.
+    A folder with a ``train.csv`` or a ``summary.json`` but no ``eval.csv`` is among them: reading it says what is
+    missing.
 
     Args:
         paths (iterable of str or Path): run directories, or folders of run directories at any depth.
@@ -76,10 +76,9 @@ def find_runs(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
 
 
 def _folders_with(names: set[str], path: Path) -> set[Path]:
-    """With one of the files; also behind links to folders, each of them once.
+    """The folders that hold one of the files, each once; links to folders are followed.
 
-    What cannot be looked into is among them, and so are links that lead nowhere and stand beside a run: who reads them
-    learns why not.
+    A folder that cannot be opened is among them, and so is a broken link beside a run: reading it says what is wrong.
     """
     found, seen, nowhere = {}, set(), []
 

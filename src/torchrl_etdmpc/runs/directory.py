@@ -20,7 +20,7 @@ from torchrl_etdmpc.runs.files import DamagedFileError, load_yaml, read_whole, w
 _CONFIG_BYTES = 2**20
 _SEAL = "# what this run trains with, as it was written: sha256 "
 IN_USE = "is in use by another process"
-"""What who finds the directory locked is told; a suite looks for it at the end of a run's log."""
+"""Part of the error where another process has the lock; a suite looks for it at the end of a run's log."""
 
 
 class RunDirectory:

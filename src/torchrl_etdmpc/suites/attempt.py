@@ -109,9 +109,10 @@ def note(run: Run, verdict: Verdict, why: str) -> None:
 
 
 def last_verdict(run: Run) -> tuple[Verdict, str] | None:
-    """What was decided about a run, and why, if no process of it began later, nor one that wrote no log.
+    """What was decided about a run, and why; ``None`` if it has been trained since.
 
-    The latter is one that was begun by hand: its tables are newer than the log.
+    A process that the suite began writes into the log after the verdict. One that was begun by hand does not, but its
+    tables are newer than the log.
     """
     directory = RunDirectory(run.path)
     if max(map(_changed_at, (directory.eval, directory.train))) > _changed_at(log_file(run)):

@@ -130,7 +130,7 @@ class Search:
     def points(self) -> list[dict[str, Any]]:
         """Every value of a list and both ends of a range, one at a time.
 
-        What is wrong with one of them is so refused before anything is trained; what two of them are together shows
+        A value that is wrong by itself is so refused before anything is trained; two that do not go together are found
         when they are proposed.
         """
         ends = {

@@ -24,10 +24,10 @@ class Sweep:
     A trial is a variant by the name of ``"{name} trial {number}"``; its value, which is maximised, is the mean over the
     experiment's tasks and seeds of the last return. After each evaluation that all runs of a trial have reached, the
     best of their means so far is compared with the means of the finished trials at the same env step: below the median
-    of five or more, the trial ends (Optuna's ``MedianPruner``). A trial that was running when the process was killed
-    goes on under the same settings; so does, in the next process, one of whose runs was given up. A proposal that
-    cannot be trained, because of what two of its settings are together, is a failed trial. Processes that share the
-    folder share the trials: each follows those that were open when it began and those that it proposed itself.
+    of five or more, the trial ends (Optuna's ``MedianPruner``). A trial that was running when the process was killed,
+    or that has a run which was given up, goes on in the next process with the same settings. A proposal whose settings
+    do not go together is a failed trial. Processes that share the folder share the trials: each follows those that were
+    open when it began and those that it proposed itself.
 
     Args:
         experiment (Experiment): that holds the search.

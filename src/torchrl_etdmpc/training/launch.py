@@ -278,7 +278,11 @@ def with_stored_settings(
 
 
 def _says_its_settings(directory: RunDirectory, resume: str) -> bool:
-    """Whether a run is there whose settings can be read; one that goes on without them would be another run."""
+    """Whether there is a file that says the settings of the run.
+
+    Raises:
+        FileNotFoundError: if a run is to go on and there is none: with other settings it would be another run.
+    """
     there = directory.config.exists() or directory.last_agent.exists()
     if directory.holds_a_run and resume != "off" and not there:
         weights = directory.last_agent.relative_to(directory.path)

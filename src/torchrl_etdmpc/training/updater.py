@@ -32,8 +32,9 @@ class Updater:
     Every parameter of the loss is trained, also those that a term of the user's own brings; these are clipped with the
     model's. A frozen parameter (``requires_grad_(False)``) stays as it is.
 
-    Targets begin where they are, which in a new loss is at the weights. TorchRL's own updaters copy the weights into
-    them first: who loads a world model behind its loss makes the loss anew, or loads the loss.
+    Targets begin where they are, which in a new loss is at the weights; TorchRL's own updaters copy the weights into
+    them first. Where weights are loaded into a world model that has a loss already, make the loss anew, or load the
+    loss.
 
     The weights of each part move into one piece of memory, of which the parameters become views, so that clipping, Adam
     and the target average are a few operations whatever the number of layers. Parameters that get new memory afterwards
