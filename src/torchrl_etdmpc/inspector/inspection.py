@@ -87,8 +87,6 @@ class Job:
             self.future.exception(seconds)
         except TimeoutError:
             return False
-        except BaseException:  # it was dropped before it began
-            return True
         return True
 
 

@@ -74,9 +74,9 @@ def connect_plans(app: Any, inspection: Inspection) -> None:
             count = f"{job.done} of {job.of}" if job.of else ""
             return no_update, number, False, f"{job.what} {count}", part, "", "", ""
         assert job.future is not None
-        if job.future.cancelled() or job.future.exception() is not None:
-            error = "" if job.future.cancelled() else " ".join(str(job.future.exception()).split())
-            return no_update, number, True, "", "0", "hidden", "hidden", error
+        failure = job.future.exception()
+        if failure is not None:
+            return no_update, number, True, "", "0", "hidden", "hidden", " ".join(str(failure).split())
         made = job.future.result()
         if held in inspection.traces and held not in (job.like, made) and job.request is not None:
             state, changes, seed = job.request  # another plan was held meanwhile: again, in its components
