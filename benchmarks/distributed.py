@@ -4,7 +4,7 @@
     python benchmarks/distributed.py --seeds 1 --variants multi
     python benchmarks/distributed.py --report-only         # from the committed files
 
-Runs one after the other: one process (`examples/train.py`), two workers of TorchRL's MultiCollector and two of its
+Runs one after the other: one process (`examples/train.py`), two workers of TorchRL's MultiAsyncCollector and two of its
 RayCollector (`examples/distributed.py`), all with one thread per process. Writes
 `benchmarks/results/cpu/distributed/<variant>/seed<k>/{train.csv,eval.csv,summary.json}` and `README.md` there. A run
 that is there already is kept; remove its folder to repeat it.
