@@ -80,5 +80,6 @@ def evaluate(planner: EnsembleMPPIPlanner, seed: int, episodes: int = 10) -> flo
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    seed, steps = [*map(int, sys.argv[1:]), *(0, 3000)[len(sys.argv) - 1 :]]
+    seed = int(sys.argv[1]) if len(sys.argv) > 1 else 0
+    steps = int(sys.argv[2]) if len(sys.argv) > 2 else 3000
     print(f"seed {seed}, {steps} steps: mean return {evaluate(train(seed, steps), seed + 1000):.0f}")
