@@ -16,7 +16,7 @@ from torchrl_etdmpc.commands.command_line import nearest, one_line_errors
 from torchrl_etdmpc.commands.settings_help import Setting, help_text, settings_of
 from torchrl_etdmpc.envs import import_task
 from torchrl_etdmpc.runs import RunDirectory, console
-from torchrl_etdmpc.runs.files import alone
+from torchrl_etdmpc.runs.files import file_lock
 from torchrl_etdmpc.suites import (
     Experiment,
     Run,
@@ -167,7 +167,7 @@ def main() -> None:
         raise ValueError("engine=slurm cannot search: the next trial depends on those before it; use local or ray.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with alone(folder / _LOCK):
+        with file_lock(folder / _LOCK):
             stored = _stored(folder)  # by now; another command may have added to it
             write_experiment(asked if stored is None else extended(stored, asked, folder), folder / _FILE)
     except OSError as error:
@@ -229,7 +229,7 @@ def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: 
     file = folder / _FILE
 
     def keep(variant: str, settings: dict[str, Any]) -> None:
-        with alone(folder / _LOCK):
+        with file_lock(folder / _LOCK):
             known = read_experiment(file)
             if variant not in known.variants:
                 write_experiment(dataclasses.replace(known, variants={**known.variants, variant: settings}), file)

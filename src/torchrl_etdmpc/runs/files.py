@@ -56,12 +56,12 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview | str) -> No
 
 
 @contextmanager
-def alone(lock: Path) -> Iterator[None]:
-    """Other processes that ask for the same file wait for the block, which reads a file, changes it and writes it.
+def file_lock(lock: Path) -> Iterator[None]:
+    """Locks a file for a block that reads, changes and writes another one; processes that want the same lock wait.
 
-    The file stays there, empty. Nobody waits where there are no system locks.
+    The locked file stays there, empty. Nobody waits where there are no system locks.
 
-    >>> with alone(Path(tempfile.mkdtemp()) / ".lock"):
+    >>> with file_lock(Path(tempfile.mkdtemp()) / ".lock"):
     ...     pass
     """
     try:
