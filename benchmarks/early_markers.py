@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from torchrl_etdmpc.runs import RunDirectory
+
 MARKERS = (
     "consistency_error",
     "reward_error",
@@ -51,18 +53,19 @@ def ranges(folders: dict[str, Path]) -> str:
     """
     rows = []
     for name, folder in folders.items():
-        tables = [path for path in sorted(folder.rglob("train.csv")) if (path.parent / "eval.csv").is_file()]
-        if not tables:
+        runs = [RunDirectory(path.parent) for path in sorted(folder.rglob(RunDirectory("").train.name))]
+        runs = [run for run in runs if run.eval.is_file()]
+        if not runs:
             raise ValueError(f"{str(folder)!r} must hold run directories with a train.csv.")
-        frames = [pd.read_csv(path) for path in tables]
+        frames = [pd.read_csv(run.train) for run in runs]
         early = pd.concat([frame[frame["env_steps"].between(FIRST, LAST)] for frame in frames])
         if early.empty:
             raise ValueError(f"the runs in {str(folder)!r} have no row between {FIRST:,} and {LAST:,} env steps.")
-        finals = [pd.read_csv(path.parent / "eval.csv")["return_mean"].iloc[-1] for path in tables]
+        finals = [pd.read_csv(run.eval)["return_mean"].iloc[-1] for run in runs]
         for marker in MARKERS:
             values = early[marker].dropna()
             low, median, high = (f"{values.quantile(share):.4g}" for share in (0, 0.5, 1))
-            rows.append([name, marker, low, median, high, len(tables), f"{sum(finals) / len(finals):.1f}"])
+            rows.append([name, marker, low, median, high, len(runs), f"{sum(finals) / len(finals):.1f}"])
     memory = io.StringIO()
     writer = csv.writer(memory, lineterminator="\n")
     writer.writerow(["runs", "marker", "low", "median", "high", "seeds", "final_return"])
