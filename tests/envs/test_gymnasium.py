@@ -94,8 +94,9 @@ def test_actions_of_any_shape_and_precision_arrive_as_the_environment_wants_them
     np.testing.assert_array_equal(arrived, [[3, -3], [0, 1.5]])
 
 
-def test_an_observation_of_any_shape_is_a_float32_vector_in_memory_of_its_own(recorder):
-    env = make_env(recorder())
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_an_observation_of_any_shape_is_a_float32_vector_in_memory_of_its_own(recorder, dtype):
+    env = make_env(recorder(observation=Box(-np.inf, np.inf, (2, 3), dtype)))
     first = env.reset()
     before = first["observation"].clone()
     second = env.step(first.set("action", torch.zeros(2)))
