@@ -615,6 +615,15 @@ def test_further_keys_can_be_kept_out_of_the_buffer():
     assert {"observation", ("next", "observation"), ("next", "terminated"), "truncated"} <= keys
 
 
+def test_what_is_kept_out_of_the_buffer_need_not_be_finite():
+    env = TransformedEnv(LineEnv(broken="observation", broken_at=2), StepCounter())
+    policy = RandomActions()
+    policy.in_keys = ["step_count"]
+    keys = ["observation", ("next", "observation")]
+    collector = StepCollector(env, policy, replay_buffer=make_replay(), total_frames=5, exclude_keys=keys)
+    assert len(list(collector)) == 5
+
+
 @pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
 def test_a_policy_device_changes_nothing_but_where_the_policy_runs(lengths):
     stored = []
