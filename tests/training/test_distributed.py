@@ -186,6 +186,26 @@ def test_a_row_says_how_many_updates_older_its_weights_were_than_the_learner_s(s
     learner.collector.shutdown()
 
 
+def test_a_random_action_has_no_age_whenever_it_arrives(started):
+    started()
+    learner = learner_of(config_of())
+    learner.collector.act()
+    learner.agent.world_model.version += 5
+    assert learner.collector.finish_step()["weight_age"].eq(-1).all()
+    learner.collector.shutdown()
+
+
+def test_a_batch_of_one_worker_passes_every_interval_that_ends_in_it(started):
+    started()
+    learner = learner_of(config_of(workers=1))
+    passed = []
+    for _ in range(6):
+        learner.step()
+        passed.append(learner.passed(10))
+    assert passed == [False, True, True, True, True, False]  # at 8, 16, ... 48
+    learner.collector.shutdown()
+
+
 def test_weights_are_sent_as_soon_as_there_are_as_many_updates_as_are_said(started):
     started()
     learner = learner_of(config_of(send_every=16))
@@ -206,6 +226,14 @@ def test_no_worker_of_a_run_begins_as_one_of_a_run_with_another_seed_does():
         parts = distributed.WorkerParts(config_of(seed=seed), (3, 1), discount=0.99)
         starts |= {tuple(parts.make_env(number).reset()["observation"].tolist()) for number in range(3)}
     assert len(starts) == 9
+
+
+def test_what_a_worker_draws_follows_from_its_number():
+    parts, draws = distributed.WorkerParts(config_of(), (3, 1), discount=0.99), []
+    for number in (0, 1, 0):
+        parts.make_env(number)
+        draws.append(torch.rand(3).tolist())
+    assert draws[0] == draws[2] != draws[1]
 
 
 def test_only_the_worker_that_sent_rows_gets_weights_where_each_has_its_own(started, monkeypatch):
@@ -268,6 +296,7 @@ def test_slices_never_join_the_rows_of_two_workers(started):
     explore_and_pretrain(learner)
     numbers = learner.replay[:]["worker"].flatten()
     assert numbers.unique().tolist() == [0, 1, 2]
+    assert {"weight_age", ("next", "worker")}.isdisjoint(learner.replay[:].keys(True, True))
     assert learner.replay[:]["collector", "traj_ids"].unique().tolist() == [0]  # of each worker
     for _ in range(20):
         slices = learner.replay.sample().reshape(-1, 3)
@@ -568,11 +597,12 @@ def test_a_signal_is_obeyed_while_the_workers_hang(tmp_path, monkeypatch, where,
 
 
 def test_workers_that_send_nothing_are_told_of_again_and_again(monkeypatch):
-    goes_on, told = threading.Event(), []
+    goes_on, told, waited = threading.Event(), [], []
 
     def warning(text: str) -> None:
         told.append(text)
         if len(told) == 3:
+            waited.append(time.monotonic() - began)
             goes_on.set()
 
     class Hanging(Workers):
@@ -588,10 +618,12 @@ def test_workers_that_send_nothing_are_told_of_again_and_again(monkeypatch):
     learner = learner_of(config_of(workers=1))
     learner.collector.act()
     monkeypatch.setattr(torchrl_logger, "warning", warning)
+    began = time.monotonic()
     assert len(learner.collector.finish_step()) == 8
     assert all(
         text.startswith("no worker has sent rows for 0 minutes; if their simulators hang, Ctrl-C") for text in told
     )
+    assert waited[0] > 3 * 0.2  # once in every such time
     learner.collector.shutdown()
 
 
