@@ -848,6 +848,7 @@ def test_a_collector_that_has_not_acted_can_be_saved_even_if_its_workers_rescale
 
     first, second = make_collector(), make_collector()
     second.load_state_dict(first.state_dict())
+    assert not second.begins_fresh  # there was nothing to come back to
     second.act()
     assert second.state_dict()["simulator"] is None
     second.step()
