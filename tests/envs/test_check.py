@@ -73,6 +73,10 @@ _MENDED = {
         {"observations": {"position": Unbounded(2), "velocity": Unbounded(3)}},
         "observation is missing (append CatTensors(in_keys=['position', 'velocity'], out_key='observation'))",
     ),
+    "a sum of rewards beside a vector": (
+        {"observations": {"position": Unbounded(2), "episode_reward": Unbounded(1)}},
+        "observation is missing (append CatTensors(in_keys=['position'], out_key='observation'))",
+    ),
     "a text beside a vector": (
         {"observations": {"instruction": NonTensor(shape=()), "position": Unbounded(2)}},
         "observation is missing (append CatTensors(in_keys=['position'], out_key='observation'))",
@@ -188,6 +192,14 @@ _REFUSED = {
         {"action": Bounded(-1, 1, shape=(), dtype=torch.float32)},
         "action has the shape [] instead of [A]",
     ),
+    "actions under two names": (
+        {"action": Composite(left=_ACTION, right=_ACTION)},
+        "the actions are [('action', 'left'), ('action', 'right')] instead of one 'action'; ",
+    ),
+    "rewards under two names": (
+        {"reward": Composite(left=Unbounded(1), right=Unbounded(1))},
+        "the rewards are ['left', 'right'] instead of one 'reward'; ",
+    ),
     "two rewards": ({"reward": Unbounded(2)}, "reward has the shape [2] instead of [1]"),
 }
 
@@ -219,6 +231,11 @@ def test_a_frame_skip_behind_a_cast_is_nobodys_business():
     check_env(env.append_transform(FrameSkipTransform(3)))
 
 
+def test_a_frame_skip_that_repeats_nothing_is_nobodys_business():
+    env = complete(SpecEnv(action=Bounded(-2, 2, shape=(2,), dtype=torch.float32))).append_transform(ActionScaling())
+    check_env(env.append_transform(FrameSkipTransform(1)))
+
+
 def test_one_error_lists_everything():
     env = SpecEnv(
         observations={"position": Unbounded(2)},
@@ -239,6 +256,13 @@ def test_flags_and_sums_of_the_wrong_kind_are_named():
         "this environment cannot be used as it is: is_init is float32 instead of bool; episode_reward has the shape "
         "[2] instead of [1]."
     )
+
+
+def test_a_flag_of_another_shape_is_named():
+    env = SpecEnv()
+    env.done_spec = Composite({key: Binary(2, dtype=torch.bool) for key in _FLAGS})
+    text = faults(complete(env))
+    assert all(f"{key} has the shape [2] instead of [1]" in text for key in _FLAGS)
 
 
 def test_further_entries_and_transforms_are_nobodys_business():
