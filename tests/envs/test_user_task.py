@@ -77,6 +77,7 @@ def wrapped(*wrappers):
     return scaled(base=GymWrapper(env))
 def limited_by_wrapper(): return wrapped(("TimeLimit", 12))
 def repeats_by_wrapper(): return wrapped(("TimeLimit", 12), ("RepeatAction", 3))
+def repeats_and_takes_the_maximum(): return wrapped(("TimeLimit", 12), ("MaxAndSkipObservation", 3))
 def repeats_and_is_limited(): return wrapped(("RepeatAction", 3), ("TimeLimit", 5))
 ONE = scaled()
 def the_same(): return ONE
@@ -165,6 +166,7 @@ def test_several_environments_of_a_users_task(folder, path, parallel):
         ("repeats", 4, 200),
         ("repeats_by_transform", 4, 40),
         ("repeats_by_wrapper", 3, 12),
+        ("repeats_and_takes_the_maximum", 3, 12),
         ("repeats_and_is_limited", 3, 15),
     ],
 )
@@ -239,6 +241,19 @@ def test_a_shorter_time_limit_is_obeyed_and_a_longer_one_refused(folder):
     assert str(error.value) == (
         "episode_length of task 'more_tasks:limited' must be at most 30, its environment's own limit, got 31."
     )
+
+
+@pytest.mark.parametrize("told", [{"episode_length": 31}, {"action_repeat": 2}])
+def test_what_is_told_after_the_import_is_held_against_the_environment_too(folder, told):
+    import_task("more_tasks:limited")
+    with pytest.raises(ValueError, match=f"^{next(iter(told))} of task 'more_tasks:limited' must be "):
+        make_env(get_task("more_tasks:limited", **told))
+
+
+def test_the_environment_that_an_import_looks_at_is_closed(folder):
+    (folder / "raises.py").write_text(f"{_RECIPE}made = []\ndef make(): made.append(make_my_env()); return made[-1]\n")
+    import_task("raises:make")
+    assert [env.is_closed for env in sys.modules["raises"].made] == [True]
 
 
 def test_an_action_repeat_that_is_not_there_is_refused(folder):
