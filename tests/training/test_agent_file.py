@@ -250,6 +250,11 @@ def test_a_path_that_is_no_file_is_refused(tmp_path, name):
     assert refusal(path) == "is not a file; pass a checkpoint such as RUN_DIR/checkpoints/last.pt."
 
 
+def test_the_path_of_an_agent_file_may_begin_at_home(saved, monkeypatch):
+    monkeypatch.setenv("HOME", str(saved[0].parent))
+    assert read_agent_file("~/last.pt")["counters"] == COUNTERS
+
+
 @pytest.mark.parametrize("sizes", [(24, 6), (OBSERVATION_DIM, 6), (24, ACTION_DIM)])
 def test_an_environment_of_another_size_is_refused_with_the_task_that_fits(saved, sizes):
     message = refusal(saved[0], lambda path: load_agent(path, observation_dim=sizes[0], action_dim=sizes[1]))
@@ -352,6 +357,7 @@ def test_what_a_task_of_one_s_own_was_is_stored_with_its_agent(tmp_path, saved, 
         ("world_model", 3, "is not a checkpoint: its world_model is of type int, not Mapping."),
         ("loss", {"scale": 1.0}, "is not a checkpoint: scale is no tensor but of type float."),
         ("loss", {"scale": torch.tensor(math.nan)}, "cannot be used: scale holds numbers that are not finite."),
+        ("loss", {"scale": torch.tensor(math.inf)}, "cannot be used: scale holds numbers that are not finite."),
         (
             "updater",
             {"averaged": {"policy.bias": torch.tensor(math.nan)}},
