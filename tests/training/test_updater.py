@@ -336,6 +336,9 @@ def test_the_targets_that_a_term_of_one_s_own_reads_move_too():
                 assert torch.equal(targets[key], before[name][key]) != leader.requires_grad
     targets = loss.targets()["encoder"]
     assert all(targets[key].equal(value) for key, value in followed["encoder"][0].items())
+    kept = followed["encoder"][0].clone()
+    Updater(loss)  # leaves them where they are
+    assert all(loss.targets()["encoder"][key].equal(value) for key, value in kept.items())
 
 
 @pytest.mark.parametrize("kind", [EfficientTDMPCModelLoss, EfficientTDMPCPolicyLoss])
