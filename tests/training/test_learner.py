@@ -245,6 +245,7 @@ def test_the_counts_of_a_learner_are_its_state(tmp_path, tiny_config, make_run):
         other.step()
     row = other.pop_row()
     assert (row["loss"], row["simulator_faults"]) == (2, 5)
+    assert math.isnan(row["target_age"])  # a column of every row, though nothing is reanalyzed yet
     assert len(list(other.pretrain())) == 7 - 3
 
 
