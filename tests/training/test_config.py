@@ -420,6 +420,19 @@ REFUSED_AT_ONCE = [
         "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise the budget or lower "
         "replay.seed_decisions.",
     ),
+    (
+        {"total_env_steps": 2500, "episode_length": 500},
+        "total_env_steps must exceed the random phase of 2500 env steps, got 2500; raise the budget or lower "
+        "replay.seed_decisions or task.episode_length.",
+    ),
+    *(  # a shorter episode would change nothing
+        (
+            {"total_env_steps": 2000, "episode_length": length, **given},
+            "total_env_steps must exceed the random phase of 2000 env steps, got 2000; raise the budget or lower "
+            "replay.seed_decisions.",
+        )
+        for length, given in ((400, {}), (500, {"replay__seed_decisions": 1000}))
+    ),
     (  # 21 decisions of two environments are 22
         {"total_env_steps": 44, "num_envs": 2, "replay__seed_decisions": 21},
         "total_env_steps must exceed the random phase of 44 env steps, got 44; raise the budget or lower "
@@ -620,6 +633,12 @@ def test_a_run_can_change_what_is_known_of_its_task():
     assert (task.name, task.action_repeat, task.episode_length, task.terminates) == ("walker-walk", 4, 802, True)
     assert (config.seed_decisions, config.total_decisions) == (1005, 2501)
     assert TrainConfig().task_spec == TrainConfig(action_repeat=2, episode_length=1000, terminates=False).task_spec
+
+
+@pytest.mark.parametrize(("batch_size", "every", "states"), [(256, 10, 60), (20, 10, 60), (4, 10, 12), (256, 0, 0)])
+def test_reanalyze_plans_for_no_more_states_than_a_batch_has(batch_size, every, states):
+    config = TrainConfig.from_dict(overrides(optim__batch_size=batch_size, reanalyze__every=every))
+    assert config.refreshed_states == states
 
 
 def test_the_settings_of_a_task_may_be_what_makes_it_possible():

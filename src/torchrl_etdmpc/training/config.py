@@ -39,6 +39,7 @@ def typed_name(name: str) -> str:
     return f"task.{name}" if name in TASK_SETTINGS else name
 
 
+_LEAST_SEED_DECISIONS = 1000  # unless told
 _FAILED_RESETS = 100  # that a buffer has room for
 MOST_EPISODES = 10_000
 """Of one evaluation: each is an environment in memory."""
@@ -317,7 +318,9 @@ class TrainConfig:
         )
         together = max(self.decisions_per_step, 1)
         seed_env_steps = -(-self.seed_decisions // together) * together * task.action_repeat
-        lower = "replay.seed_decisions" + " or task.episode_length" * bool(self.episode_length)
+        lower = "replay.seed_decisions"
+        if self.episode_length and self.replay.seed_decisions is None and self.seed_decisions > _LEAST_SEED_DECISIONS:
+            lower += " or task.episode_length"
         if together > self.seed_decisions:
             lower = self._step_setting
         _require(
@@ -351,7 +354,7 @@ class TrainConfig:
         """Length of the random phase in decisions (default: max(1000, 5 episodes))."""
         if self.replay.seed_decisions is not None:
             return self.replay.seed_decisions
-        return max(1000, 5 * self.task_spec.decision_steps_per_episode)
+        return max(_LEAST_SEED_DECISIONS, 5 * self.task_spec.decision_steps_per_episode)
 
     @property
     def refreshed_states(self) -> int:
