@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cloudpickle
@@ -29,7 +30,7 @@ pytest.importorskip("gymnasium")
 import torchrl_etdmpc.training.distributed as distributed  # noqa: E402
 from torchrl_etdmpc.checkpoints import CheckpointStore  # noqa: E402
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError  # noqa: E402
-from torchrl_etdmpc.envs import Task, make_env, register_task, tasks  # noqa: E402
+from torchrl_etdmpc.envs import Task, import_task, make_env, register_task, tasks  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     DistributedConfig,
@@ -43,8 +44,10 @@ from torchrl_etdmpc.training import (  # noqa: E402
     read_run_config,
     resumed_config,
 )
+from torchrl_etdmpc.training.own_code import follow_own_code  # noqa: E402
 from torchrl_etdmpc.training.ray_cluster import RayCluster  # noqa: E402
 from torchrl_etdmpc.training.signals import RunInterrupted  # noqa: E402
+from torchrl_etdmpc.training.workers import send_weights  # noqa: E402
 
 TINY: dict[str, Any] = {
     "task": "gym/Pendulum-v1",
@@ -156,7 +159,7 @@ def test_workers_act_at_random_until_they_get_weights_to_plan_with(started):
     assert rows["plan", "scale"][:40].eq(1).all() and rows["plan", "version"][:40].eq(0).all()
     assert rows["plan", "version"][40:].eq(5).all() and rows["plan", "scale"][40:].ne(1).any()
     learner.collector.shutdown()
-    assert workers[0].closed
+    assert workers[0].closed and learner.collector.env.is_closed
 
 
 def test_each_worker_holds_random_actions_of_its_own(started):
@@ -186,12 +189,17 @@ def test_a_row_says_how_many_updates_older_its_weights_were_than_the_learner_s(s
     learner.collector.shutdown()
 
 
-def test_a_random_action_has_no_age_whenever_it_arrives(started):
+def test_a_random_action_has_no_age_whenever_it_arrives(started, monkeypatch):
     started()
     learner = learner_of(config_of())
     learner.collector.act()
     learner.agent.world_model.version += 5
-    assert learner.collector.finish_step()["weight_age"].eq(-1).all()
+    rows = learner.collector.finish_step()
+    assert rows["weight_age"].eq(-1).all()
+    rows["weight_age"][5:] = 4  # as of a worker that began to plan meanwhile
+    monkeypatch.setattr(learner.collector, "finish_step", lambda acted: rows)
+    learner.step(updates=True)
+    assert learner.pop_row()["weight_age"] == 4
     learner.collector.shutdown()
 
 
@@ -326,6 +334,7 @@ def test_after_a_failure_other_workers_go_on_in_fresh_episodes(started):
     for _ in range(2):
         learner.step(updates=True)
     assert workers[1].sent[0] == (None, True, learner.agent.updater.updates - 16)
+    assert learner.collector.decisions_each == 8  # of those that play now
     assert learner.replay[:]["worker"].unique().tolist() == [0, 1, 2, 3]
     learner.collector.shutdown()
 
@@ -380,6 +389,33 @@ def test_a_worker_knows_a_task_that_the_program_has_registered_without_a_maker(m
     parts = distributed.WorkerParts(config, (25, 5), 0.99, None, distributed.known_here(config))
     monkeypatch.setattr(tasks, "_tasks", {})
     assert parts.make_env(0).rollout(2)["action"].shape == (2, 5)
+
+
+def test_a_worker_imports_a_task_of_ones_own_as_it_was_told(tmp_path, monkeypatch):
+    (tmp_path / "workers_task.py").write_text(
+        "from gymnasium.envs.classic_control.pendulum import PendulumEnv\n"
+        "from torchrl.envs import ActionScaling, GymWrapper, TransformedEnv\n"
+        "def make(): return TransformedEnv(GymWrapper(PendulumEnv()), ActionScaling())\n"  # shows no time limit
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    import_task("workers_task:make", episode_length=20)
+    config = config_of(task="workers_task:make")
+    parts = distributed.WorkerParts(config, (3, 1), 0.99, None, distributed.known_here(config))
+    for registry in ("_tasks", "_makers"):  # as in another process
+        monkeypatch.setattr(tasks, registry, {})
+    assert parts.make_env(0).rollout(30).shape == (20,)
+
+
+def test_a_worker_plans_with_a_score_of_ones_own(tmp_path, monkeypatch):
+    (tmp_path / "workers_score.py").write_text("def cautious(returns): return returns.mean((-3, -2, -1))\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("torchrl_etdmpc.training.own_code._followed", {})
+    follow_own_code("planner.score", "workers_score:cautious")
+    parts = distributed.WorkerParts(
+        config_of(planner=TINY["planner"] | {"score": "workers_score:cautious"}), (3, 1), 0.99
+    )
+    monkeypatch.setattr("torchrl_etdmpc.training.own_code._followed", {})  # as in another process
+    assert parts.make_actor().planner.score.function.__name__ == "cautious"
 
 
 def test_rows_that_are_not_finite_are_not_stored(started):
@@ -466,6 +502,11 @@ def test_settings_that_workers_cannot_follow_are_refused(changes, message):
     with pytest.raises(ValueError) as caught:
         config_of(**changes)
     assert str(caught.value).startswith(message)
+
+
+def test_batches_of_a_whole_slice_need_no_more_rows_than_those_of_one_process():
+    config = config_of(workers=8, rows_per_batch=3, replay={"seed_decisions": 16})
+    assert (config.seed_decisions, config.loss.slice_len) == (16, 3)
 
 
 def test_an_agent_file_is_loaded_by_one_process_and_its_run_gone_on_with_by_workers(started, tmp_path):
@@ -625,6 +666,29 @@ def test_workers_that_send_nothing_are_told_of_again_and_again(monkeypatch):
     )
     assert waited[0] > 3 * 0.2  # once in every such time
     learner.collector.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("exitcode", "message"),
+    [
+        (1, r"^worker 1 ended \(exit code 1; its own error stands above\)$"),
+        (-9, r"^worker 1 ended \(exit code -9\)$"),
+        (None, r"^it has not answered for 0\.1 seconds$"),
+    ],
+)
+def test_a_worker_that_takes_no_weights_is_not_waited_for(monkeypatch, exitcode, message):
+    class Hanging:
+        procs = [SimpleNamespace(exitcode=None), SimpleNamespace(exitcode=exitcode)]
+
+        def update_policy_weights_(self, weights: TensorDictBase, worker_ids: list[int] | None) -> None:
+            goes_on.wait(60)
+
+    goes_on = threading.Event()
+    for name, seconds in {"_PATIENCE_S": 0.1, "_LOOK_EVERY_S": 0.01}.items():
+        monkeypatch.setattr(f"torchrl_etdmpc.training.workers.{name}", seconds)
+    with pytest.raises(RuntimeError, match=message):
+        send_weights(Hanging(), TensorDict())
+    goes_on.set()
 
 
 @pytest.mark.slow
