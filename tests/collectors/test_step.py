@@ -780,6 +780,14 @@ def test_ends_that_faults_made_are_made_again_in_a_buffer_that_was_saved_before(
     assert torch.equal(other.sampler.sample(other.storage, 300)[0], rows)
 
 
+def test_the_ends_of_every_fault_are_kept():
+    collector = StepCollector(make_env((9,)), RandomActions(), replay_buffer=make_replay())
+    for _ in range(2):
+        collector.step()
+        collector._truncate_episodes()  # as a fault does
+    assert collector.state_dict()["ended_rows"] == {0: 0, 1: 1}
+
+
 def test_going_back_forgets_the_ends_that_faults_made_since(monkeypatch):
     monkeypatch.setattr("torchrl_etdmpc.collectors.step.load_simulator_state", lambda *_: True)
     monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: {})
