@@ -196,6 +196,10 @@ _REFUSED = {
         r"has pixel observations \[8, 8, 3\]; only vectors are supported\.",
     ),
     "grey pixels": ({"observation": Box(0, 255, (8, 8), np.uint8)}, r"has pixel observations \[8, 8\]; only vectors"),
+    "pixels as numbers": (
+        {"observation": Box(0, 1, (8, 8, 3), np.float32)},
+        r"has pixel observations \[8, 8, 3\]; only vectors are supported\.",
+    ),
     "dictionary": (
         {"observation": Dict(a=Box(0, 1))},
         "has observations of type Dict; only vectors are supported, .*FlattenObservation makes",
