@@ -387,8 +387,9 @@ def test_a_worker_knows_a_task_that_the_program_has_registered_without_a_maker(m
     register_task(Task("swimmer-swimmer6", "dm_control", action_repeat=2, episode_length=1000, terminates=False))
     config = config_of(task="swimmer-swimmer6")
     parts = distributed.WorkerParts(config, (25, 5), 0.99, None, distributed.known_here(config))
-    monkeypatch.setattr(tasks, "_tasks", {})
-    assert parts.make_env(0).rollout(2)["action"].shape == (2, 5)
+    for registry in (dict(tasks._tasks), {}):  # as it is without what the run changes, or not at all
+        monkeypatch.setattr(tasks, "_tasks", registry)
+        assert parts.make_env(0).rollout(2)["action"].shape == (2, 5)
 
 
 def test_a_worker_imports_a_task_of_ones_own_as_it_was_told(tmp_path, monkeypatch):
