@@ -237,14 +237,17 @@ def test_a_task_that_terminates_is_trained_on_with_a_head_or_without(
 def test_the_counts_of_a_learner_are_its_state(tmp_path, tiny_config, make_run):
     learner, other = (make_run(tiny_config(), tmp_path / name).learner for name in ("one", "other"))
     state = {"pretrained": 3, "faults": 5, "faults_in_a_row": 2}
-    means = {"updates": {"sums": [(["loss"], torch.tensor([6.0]), 3)]}, "decisions": {"sums": []}}
+    means = {
+        "updates": {"sums": [(["loss"], torch.tensor([6.0]), 3)]},
+        "decisions": {"sums": [(["episode_return"], torch.tensor([8.0]), 2)]},
+    }
     learner.load_state_dict(state | means)
     other.load_state_dict(learner.state_dict())
     assert {name: other.state_dict()[name] for name in state} == state
     for _ in range(10):
         other.step()
     row = other.pop_row()
-    assert (row["loss"], row["simulator_faults"]) == (2, 5)
+    assert (row["loss"], row["episode_return"], row["simulator_faults"]) == (2, 4, 5)
     assert math.isnan(row["target_age"])  # a column of every row, though nothing is reanalyzed yet
     assert len(list(other.pretrain())) == 7 - 3
 
