@@ -105,7 +105,10 @@ def test_an_environment_without_processes_has_none_to_start():
 
 
 def test_processes_that_cannot_start_again_hide_no_failure(monkeypatch):
+    asked = []
+
     def refuse(env):
+        asked.append(env)
         raise EOFError
 
     monkeypatch.setattr("torchrl_etdmpc.collectors.step.start_workers_anew", refuse)
@@ -119,3 +122,4 @@ def test_processes_that_cannot_start_again_hide_no_failure(monkeypatch):
     monkeypatch.setattr(env, "step_and_maybe_reset", fail)
     with pytest.raises(SimulatorError, match="^the environment failed at decision step 1: worker 1 dead"):
         collector.step()
+    assert asked == [env]
