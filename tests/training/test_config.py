@@ -34,6 +34,7 @@ from torchrl_etdmpc.training.config import (
     PlannerConfig,
     ReanalyzeConfig,
     ReplayConfig,
+    named_settings,
 )
 
 GROUPS = {
@@ -384,6 +385,7 @@ REFUSED_AT_ONCE = [
     ({"replay__seed_decisions": -1}, "replay.seed_decisions must not be negative, got -1."),
     ({"replay__seed_hold": 0.5}, "replay.seed_hold must be at least 1, got 0.5."),
     ({"eval_episodes": 20_000}, "eval_episodes must be at most 10000, got 20000."),
+    *(({name: 5000}, f"{name} must be at most 4096, got 5000.") for name in ("num_envs", "threads")),
     ({"action_repeat": 1001}, "action_repeat of task 'walker-walk' must be at most episode_length=1000, got 1001."),
     (
         {"loss__slice_len": 501},
@@ -560,6 +562,11 @@ def test_a_setting_that_a_part_refuses_is_named_as_the_command_line_names_it(set
     with pytest.raises(ValueError) as caught:
         build(config)
     assert str(caught.value) == message
+
+
+def test_what_a_part_refuses_is_named_by_the_group_if_it_is_no_setting():
+    with pytest.raises(ValueError, match="^loss: all parameters are frozen$"), named_settings("loss", LossConfig()):
+        raise ValueError("all parameters are frozen")
 
 
 def build(config: TrainConfig) -> None:
