@@ -359,6 +359,21 @@ def test_what_transforms_remember_goes_on_too(name, num_envs):
             assert (stepped == wanted).all()
 
 
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_transforms_around_what_was_not_reset_yet_are_no_error(name):
+    simulator_state(remembering(name, 1))
+
+
+def test_what_a_file_cannot_hold_of_a_transform_cannot_be_restored():
+    class Odd(Transform):
+        def get_extra_state(self):
+            return object()
+
+    env = make_any_env("pendulum-swingup").append_transform(Odd(in_keys=[], out_keys=[]))
+    env.reset()
+    assert simulator_state(env) is None
+
+
 def test_the_weights_of_a_transform_s_network_are_no_part_of_a_state():
     transform = Transform()
     transform.network = torch.nn.Linear(2, 2)
