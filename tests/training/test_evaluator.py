@@ -151,6 +151,13 @@ def test_the_result_is_that_of_the_planner(agent):
     assert evaluator()[:3] == expected[:3]
 
 
+def test_an_evaluator_may_be_closed_twice(agent):
+    evaluator = make_evaluator(agent)
+    for _ in range(2):
+        evaluator.close()
+    assert evaluator.env.is_closed
+
+
 def test_lengths_and_success_are_reported_where_they_are_asked_for(agent):
     returns = make_evaluator(agent)
     torch.manual_seed(5)
