@@ -66,7 +66,15 @@ def test_a_narrow_terminal_loses_no_line(monkeypatch, columns):
     assert " ".join(terminal.getvalue().split()).endswith("a word of warning")
 
 
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), BrokenPipeError(), ValueError()])
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        BrokenPipeError(),
+        ValueError("I/O operation on closed file"),
+        RuntimeError("reentrant call inside <_io.BufferedWriter name='<stdout>'>"),  # of a signal's handler
+    ],
+)
 def test_what_cannot_be_shown_ends_nothing(monkeypatch, error):
     class Full(io.StringIO):
         def write(self, text: str) -> int:

@@ -41,7 +41,8 @@ def console() -> Iterator[None]:
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         if record.levelno >= logging.WARNING or Path(record.pathname).resolve().is_relative_to(_PACKAGE):
-            with contextlib.suppress(OSError, ValueError):  # a full disk or a closed pipe does not end what it tells of
+            # A full disk, a closed pipe, or a signal in the middle of a line does not end what it tells of.
+            with contextlib.suppress(OSError, ValueError, RuntimeError):
                 _write(self.format(record), sys.stdout)
 
 
