@@ -1,16 +1,8 @@
 """Many runs: experiments as files, the engines that carry them out, and where each run is."""
 
-from torchrl_etdmpc.suites.experiment import (
-    TASK_SETS,
-    Experiment,
-    Run,
-    Search,
-    extended,
-    find_experiment,
-    read_experiment,
-    require_unchanged,
-    write_experiment,
-)
+from torchrl_etdmpc.suites.begun import extended, require_unchanged
+from torchrl_etdmpc.suites.experiment import Experiment, Run, Search
+from torchrl_etdmpc.suites.experiment_file import TASK_SETS, find_experiment, read_experiment, write_experiment
 from torchrl_etdmpc.suites.index import Progress, RunIndex, read_progress
 from torchrl_etdmpc.suites.local import run_locally
 from torchrl_etdmpc.suites.ray_engine import run_on_ray

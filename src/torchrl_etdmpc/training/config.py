@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
-import types
-import typing
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,7 +22,7 @@ from torchrl_etdmpc.planners import FirstAction, InitialPlan, ScoringDtype
 from torchrl_etdmpc.planners.scores import ScoreName
 from torchrl_etdmpc.replay.slices import UniformOver
 from torchrl_etdmpc.runs import LoggerName
-from torchrl_etdmpc.training.own_code import OWN_CODE, own_code
+from torchrl_etdmpc.training.conversion import check_types, config_from_dict, require
 
 TASK_SETTINGS = ("action_repeat", "episode_length", "terminates")
 """Written as ``task.action_repeat`` etc. on the command line; ``task`` itself is a name, not a group."""
@@ -272,20 +270,20 @@ class TrainConfig:
     """The setting that says how many decisions come together; a class attribute and no setting itself."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         check_device(self.device)
-        _require(
+        require(
             self.checkpoint_minutes is None or self.checkpoint_minutes > 0,
             f"checkpoint_minutes must be positive or null, got {self.checkpoint_minutes}.",
         )
-        _require(0 <= self.seed < 2**32, f"seed must be in [0, 2**32 - 1], got {self.seed}.")
+        require(0 <= self.seed < 2**32, f"seed must be in [0, 2**32 - 1], got {self.seed}.")
         counts = ("num_envs", "eval_every", "eval_episodes", "checkpoint_every", "checkpoint_keep", "log_every")
         least_one = {name: getattr(self, name) for name in (*counts, "max_faults", "max_skipped", "threads")}
         least_one |= {"optim.batch_size": self.optim.batch_size, "replay.capacity": self.replay.capacity}
         least_one |= {"optim.updates_per_decision": self.optim.updates_per_decision}
         least_one |= {"replay.seed_hold": self.replay.seed_hold}
         for name, number in least_one.items():
-            _require(number is None or number >= 1, f"{name} must be at least 1, got {number}.")
+            require(number is None or number >= 1, f"{name} must be at least 1, got {number}.")
         coefficients = {f"loss.{name}": value for name, value in vars(self.loss).items() if name.endswith("_coef")}
         for name, number in {
             "replay.seed_decisions": self.seed_decisions,
@@ -293,18 +291,18 @@ class TrainConfig:
             "reanalyze.every": self.reanalyze.every,
             **coefficients,
         }.items():
-            _require(number >= 0, f"{name} must not be negative, got {number}.")
+            require(number >= 0, f"{name} must not be negative, got {number}.")
         for name, most in {
             "num_envs": 4096,
             "threads": 4096,
             "eval_episodes": MOST_EPISODES,
         }.items():  # each is one in memory
-            _require((getattr(self, name) or 0) <= most, f"{name} must be at most {most}, got {getattr(self, name)}.")
+            require((getattr(self, name) or 0) <= most, f"{name} must be at most {most}, got {getattr(self, name)}.")
         self._check_against_the_episode(self.task_spec)
 
     def _check_against_the_episode(self, task: Task) -> None:
         episode, slice_len = task.decision_steps_per_episode, self.loss.slice_len
-        _require(
+        require(
             slice_len <= episode,
             f"loss.slice_len must fit into an episode of {episode} decisions (task.episode_length="
             f"{task.episode_length}, task.action_repeat={task.action_repeat}), got {slice_len}.",
@@ -312,7 +310,7 @@ class TrainConfig:
         per_episode = episode * self.num_envs if self.replay.insertion == "episode" else 0
         # Fewer rows may hold nothing but the end of one episode and the beginning of the next.
         least = max(per_episode, 2 * slice_len * self.num_envs)
-        _require(
+        require(
             self.replay.capacity >= least,
             f"replay.capacity must be at least {least} with these settings, got {self.replay.capacity}.",
         )
@@ -323,17 +321,17 @@ class TrainConfig:
             lower += " or task.episode_length"
         if together > self.seed_decisions:
             lower = self._step_setting
-        _require(
+        require(
             self.total_env_steps > seed_env_steps,
             f"total_env_steps must exceed the random phase of {seed_env_steps} env steps, got {self.total_env_steps}; "
             f"raise the budget or lower {lower}.",
         )
-        _require(
+        require(
             self.seed_decisions >= slice_len * self.num_envs,
             f"replay.seed_decisions must be at least loss.slice_len * num_envs={slice_len * self.num_envs}, "
             f"got {self.seed_decisions}.",
         )
-        _require(
+        require(
             self.seed_decisions >= per_episode,
             f"replay.seed_decisions must cover an episode of every environment ({per_episode} decisions) with "
             f"replay.insertion=episode, got {self.seed_decisions}.",
@@ -438,93 +436,9 @@ def named_settings(group: str, config: Any, **renamed: str) -> Iterator[None]:
         raise ValueError(f"{group}{'.' if hasattr(config, setting) else ': '}{setting} {rest}") from error
 
 
-def config_from_dict(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
-    """A (nested) configuration dataclass from a dictionary, with every value's type and choice checked.
-
-    Args:
-        cls (type): the dataclass.
-        values (mapping): its fields, nested dataclasses as mappings; missing fields take their default.
-        prefix (str): path of the group, for messages.
-
-    Raises:
-        ValueError: if a key is unknown, or a value has the wrong type or is out of range.
-
-    >>> config_from_dict(OptimConfig, {"lr": 1e-3}).lr
-    0.001
-    """
-    hints = _type_hints(cls)
-    unknown = sorted(set(values) - set(hints))
-    _require(not unknown, f"unknown setting {prefix}{unknown[0] if unknown else ''}; known: {', '.join(hints)}.")
-    converted = {}
-    for name, value in values.items():
-        hint = hints[name]
-        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            _require(isinstance(value, Mapping), f"{prefix}{name} must be a group of settings, got {value!r}.")
-            converted[name] = config_from_dict(hint, value, f"{prefix}{name}.")
-        else:
-            converted[name] = _convert(hint, value, f"{prefix}{name}")
-    return cls(**converted)
-
-
-_type_hints = functools.cache(typing.get_type_hints)  # which evaluates every annotation anew
-
-
-def _check_types(config: Any, prefix: str = "") -> None:
-    """Checks what was not made by :func:`config_from_dict`."""
-    for name, hint in _type_hints(type(config)).items():
-        value = getattr(config, name)
-        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            _require(isinstance(value, hint), f"{prefix}{name} must be a {hint.__name__}, got {value!r}.")
-            _check_types(value, f"{prefix}{name}.")
-        else:
-            meant = _convert(hint, value, f"{prefix}{name}")
-            same = type(meant) is type(value) or isinstance(meant, float)
-            _require(same, f"{prefix}{name} must be {meant!r}, got {value!r}.")
-
-
-def _convert(hint: Any, value: Any, name: str) -> Any:
-    if name in OWN_CODE and isinstance(value, str) and (":" in value or not _has_choices(hint)):
-        own_code(OWN_CODE[name], value)
-        return value
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):  # the latter with a Literal in it
-        if value is None and type(None) in typing.get_args(hint):
-            return None
-        hint = next(option for option in typing.get_args(hint) if option is not type(None))
-    choices = typing.get_args(hint)
-    if "off" in choices and isinstance(value, bool):
-        value = "off" if value is False else "on"  # YAML reads a bare off as a boolean
-    if choices:
-        _require(value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}.")
-        return value
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        _require(abs(value) < _LARGEST_FLOAT, f"{name} must be a finite number below 1e30, got {value!r}.")
-        return float(value)
-    if hint is int and isinstance(value, int | float) and not isinstance(value, bool):
-        _require(abs(value) < _LARGEST_INT, f"{name} must be a whole number below 2**53, got {value!r}.")
-    if hint is int and isinstance(value, float) and value.is_integer():
-        return int(value)  # 2e5 is a natural way to write a budget
-    if type(value) is not hint:
-        raise ValueError(f"{name} must be of type {hint.__name__}, got {value!r}.")
-    return value
-
-
-def _has_choices(hint: Any) -> bool:
-    return any(typing.get_origin(option) is Literal for option in typing.get_args(hint))
-
-
-# What single precision holds with room for sums and squares of it, and what a float counts without a gap.
-_LARGEST_FLOAT = 1e30
-_LARGEST_INT = 2**53
-
-
 def check_device(name: str) -> None:
     """Refuses what is none of the devices that a run or a command can be on."""
-    _require(
+    require(
         re.fullmatch(r"auto|cpu|cuda(:\d+)?", name) is not None,
         f"device must be one of auto, cpu, cuda, cuda:N, got {name!r}.",
     )
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
