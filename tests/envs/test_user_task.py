@@ -75,6 +75,10 @@ def wrapped(*wrappers):
     for kind, number in wrappers:
         env = getattr(gymnasium.wrappers, kind)(env, number)
     return scaled(base=GymWrapper(env))
+def limited_by_its_spec():
+    env = PendulumEnv()
+    env.spec = gymnasium.spec("InAFile-v0")  # which nothing obeys
+    return scaled(base=GymWrapper(env))
 def limited_by_wrapper(): return wrapped(("TimeLimit", 12))
 def repeats_by_wrapper(): return wrapped(("TimeLimit", 12), ("RepeatAction", 3))
 def repeats_and_takes_the_maximum(): return wrapped(("TimeLimit", 12), ("MaxAndSkipObservation", 3))
@@ -163,6 +167,7 @@ def test_several_environments_of_a_users_task(folder, path, parallel):
     [
         ("limited", 1, 30),
         ("limited_by_wrapper", 1, 12),
+        ("limited_by_its_spec", 1, 20),
         ("repeats", 4, 200),
         ("repeats_by_transform", 4, 40),
         ("repeats_by_wrapper", 3, 12),

@@ -150,8 +150,7 @@ def _make_limited(function: Callable[[], EnvBase], task: Task, *, device: torch.
     """A function's environment, which must be what the task says it is."""
     env = _call(function, task.name)
     _require_agreement(task, env)
-    limit = _limit(env)
-    if limit is None or task.episode_length < limit:
+    if task.episode_length < min(_limits(env), default=math.inf):
         # Under a name of its own, beside a StepCounter that the environment may have.
         env = env.append_transform(StepCounter(task.decision_steps_per_episode, step_count_key="decision_count"))
     return env.to(device)
@@ -242,11 +241,18 @@ def _wrapper_repeat(wrapper: Any) -> int:
 
 
 def _limit(env: EnvBase) -> int | None:
-    """The time limit of this environment in env steps, the least that its layers tell."""
+    """The time limit of this environment in env steps, the least that its layers tell, or else what its spec says."""
+    wrappers = wrappers_of(env)
+    told = getattr(getattr(wrappers[0], "spec", None), "max_episode_steps", None) if wrappers else None
+    return min(_limits(env), default=told)
+
+
+def _limits(env: EnvBase) -> list[int]:
+    """The time limits that end an episode of this environment, in env steps."""
     # One that only tells, and ends nothing (update_done=False), is no limit.
     counters = (each for each in transforms_of(env) if isinstance(each, StepCounter) and each.update_done)
     limits = [counter.max_steps * _action_repeat(env) for counter in counters if counter.max_steps is not None]
-    return min([*limits, *_simulators_limits(env)], default=None)
+    return [*limits, *_simulators_limits(env)]
 
 
 def _simulators_limits(env: EnvBase) -> list[int]:
@@ -256,6 +262,4 @@ def _simulators_limits(env: EnvBase) -> list[int]:
         limits.append((vars(wrapper).get("_max_episode_steps") or math.inf) * repeat)
         limits.append(vars(wrapper).get("_step_limit", math.inf))
         repeat *= _wrapper_repeat(wrapper)
-    limits = [math.ceil(limit) for limit in limits if limit < math.inf]
-    told = getattr(getattr(wrappers[0], "spec", None), "max_episode_steps", None) if wrappers else None
-    return limits or ([] if told is None else [told])
+    return [math.ceil(limit) for limit in limits if limit < math.inf]
