@@ -256,12 +256,13 @@ class WorkerCollector:
     def _failed(self, error: BaseException) -> Exception:
         """The error to raise: of the simulator if new workers may do better."""
         if self._workers is None:
-            text = f"the workers cannot be started: {first_line(error)}"
+            text = at_first = f"the workers cannot be started: {first_line(error)}"
         else:
             text = why_it_failed(self._workers, error)
+            at_first = f"{text}, before it sent a row"
             self._stop()
         if not self._arrived:
-            return RuntimeError(f"{text}, before it sent a row")
+            return RuntimeError(at_first)
         return SimulatorError(f"{text}; all workers are started anew")
 
     def _check_finite(self, rows: TensorDictBase) -> None:
