@@ -15,7 +15,7 @@ import torch
 
 from torchrl_etdmpc.runs import DamagedFileError
 from torchrl_etdmpc.runs.files import (
-    alone,
+    file_lock,
     link,
     load_tensors,
     read_tensors,
@@ -163,7 +163,7 @@ def test_processes_change_a_file_one_after_the_other(tmp_path, in_copy):
 
     def count_on() -> None:
         for _ in range(50):
-            with alone(lock):
+            with file_lock(lock):
                 write_whole(file, str(int(file.read_text()) + 1))
 
     def beside_a_copy() -> None:
