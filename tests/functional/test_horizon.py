@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_variance
+from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean, ensemble_std, ensemble_variance
 from torchrl_etdmpc.functional.horizon import SIGMA_FLOOR
 
 
@@ -100,6 +100,16 @@ def test_ensemble_variance_of_one_member_or_of_agreeing_members_is_zero():
     assert single.shape == (5, 3)
     assert single.count_nonzero() == 0
     assert ensemble_variance(torch.full((5, 3, 4, 2), 7.0)).count_nonzero() == 0
+
+
+def test_where_members_agree_the_gradient_of_the_std_is_zero_and_elsewhere_that_of_the_root():
+    returns = normal(3, 4, 2)
+    returns[1] = 7.0
+    leaf, other = returns.clone().requires_grad_(), returns[[0, 2]].clone().requires_grad_()
+    ensemble_std(leaf).sum().backward()
+    ensemble_variance(other).sqrt().sum().backward()
+    assert leaf.grad[1].count_nonzero() == 0
+    torch.testing.assert_close(leaf.grad[[0, 2]], other.grad)
 
 
 def test_ensemble_variance_shifts_and_scales_as_a_variance_and_survives_a_large_offset():
