@@ -99,10 +99,13 @@ def test_a_batch_in_which_nothing_counts_leaves_the_scale_where_it_is():
     assert updated_scale(torch.tensor(7.0), torch.linspace(0, 1000, 9), 0.5, nothing) == 7
 
 
-@pytest.mark.parametrize("counts", [None, torch.arange(9) < 8])
-def test_a_nan_that_counts_leaves_the_scale_where_it_is(counts):
-    batch = torch.linspace(0, 1000, 9)
-    batch[3] = torch.nan
+@pytest.mark.parametrize("size", [9, 101])
+@pytest.mark.parametrize("some", [False, True], ids=["all-count", "some-count"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_value_that_counts_and_is_not_finite_leaves_the_scale_where_it_is(value, some, size):
+    batch = torch.linspace(0, 1000, size)
+    batch[3] = value
+    counts = torch.arange(size) < size - 1 if some else None
     assert updated_scale(torch.tensor(7.0), batch, 0.5, counts) == 7
 
 
