@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 
+import pytest
 import torch
 
 from torchrl_etdmpc.functional import simnorm
@@ -152,9 +153,10 @@ def test_bins_come_back_from_half_precision_as_they_were():
     assert torch.equal(model.bins, exact)
 
 
-def test_bins_of_a_state_with_other_ends_are_taken_over_for_good():
+@pytest.mark.parametrize("ends", [(-5.0, 8.0), (-5.0, 10.0), (-10.0, 8.0)])
+def test_bins_of_a_state_with_other_ends_are_taken_over_for_good(ends):
     model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
-    other = WorldModel(3, 2, latent_dim=16, mlp_dim=16, bin_min=-5.0, bin_max=8.0)
+    other = WorldModel(3, 2, latent_dim=16, mlp_dim=16, bin_min=ends[0], bin_max=ends[1])
     model.load_state_dict(other.state_dict())
     model.to(torch.float16).float()
     model.reset_parameters_recursive()

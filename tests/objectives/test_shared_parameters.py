@@ -196,6 +196,8 @@ def test_rewards_and_values_over_other_bins_are_refused(make_loss, make_world_mo
         return
     with pytest.raises(RuntimeError, match="of another world model: its bins reach from -10 to 10, here from -5 to 5"):
         other.load_state_dict(state)
+    with pytest.raises(RuntimeError, match="its bins reach from -10 to 10, here from -10 to 5"):
+        make_loss(kind, make_world_model(bin_max=5.0)).load_state_dict(state)
     make_loss(kind, make_world_model()).load_state_dict(make_loss(kind).bfloat16().state_dict())
     state.pop("bins")  # a file of before
     other.load_state_dict(state)
