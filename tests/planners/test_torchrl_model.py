@@ -229,6 +229,13 @@ def test_a_model_that_draws_is_refused_and_its_mean_is_not():
     assert torch.equal(before, torch.get_rng_state())
 
 
+def test_a_model_whose_reward_alone_is_drawn_is_refused():
+    move = TensorDictModule(lambda x, action: x + action, in_keys=["x", "action"], out_keys=["x"])
+    drawn = TensorDictModule(lambda x: x + torch.randn_like(x), in_keys=["x"], out_keys=["reward"])
+    with pytest.raises(ValueError, match=r"^two steps of the model from one state differ in 'reward': plans would be "):
+        TorchRLModel(WorldModelWrapper(move, drawn), action_dim=1, state_sizes={"x": 1})
+
+
 def test_what_is_no_model_of_torchrl_is_refused():
     with pytest.raises(TypeError, match=r"^model must be a ModelBasedEnvBase or a TensorDict module, got Linear; wrap"):
         make(nn.Linear(2, 2))
