@@ -103,7 +103,7 @@ def test_a_rollout_imagines_the_plan_step_by_step():
 
 def test_an_episode_ends_where_its_termination_is_more_likely_than_not(monkeypatch):
     model = make_model(termination=True)
-    probability = torch.tensor([0.4, 0.6, 0.1])
+    probability = torch.tensor([0.4, 0.6, 0.5])
     monkeypatch.setattr(model, "termination", lambda latent: probability)
     env = LatentEnv(model)
     start = env.reset(TensorDict({"observation": torch.randn(3, 3)}, batch_size=[3]))
