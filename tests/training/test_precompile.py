@@ -9,6 +9,8 @@ import sys
 
 import pytest
 import torch
+from torchrl.envs import ExplorationType
+from torchrl.envs.utils import exploration_type
 
 from torchrl_etdmpc.objectives import Term
 from torchrl_etdmpc.testing import random_slices
@@ -67,6 +69,22 @@ def test_reanalyze_is_compiled_for_as_many_rows_as_a_sample_has(tiny_config, mon
     assert shapes == [torch.Size([4 * config.loss.slice_len])]
 
 
+def test_acting_and_evaluating_are_compiled_for_as_many_states_as_each_has(tiny_config, monkeypatch):
+    config = tiny_config(compile="default")
+    agent = build_agent(config, 5, 1)
+    seen = []
+
+    def forward(planner, states):
+        seen.append((planner, states.batch_size, exploration_type()))
+
+    monkeypatch.setattr(type(agent.planner), "forward", forward)
+    parts = precompile._parts(config, agent, (), (3,))
+    parts["act"]()
+    parts["evaluate"]()
+    acting = agent.planner, torch.Size([]), ExplorationType.RANDOM
+    assert seen == [acting, (agent.eval_planner, torch.Size([3]), ExplorationType.DETERMINISTIC)]
+
+
 @pytest.mark.parametrize("terminates", [False, True])
 def test_the_graph_of_an_update_is_that_of_replayed_slices(tiny_config, terminates):
     config = tiny_config(compile="off", terminates=terminates, optim={"batch_size": 4})
@@ -108,6 +126,13 @@ def test_one_thread_compiles_in_one_process(monkeypatch, watched, tiny_config, a
     monkeypatch.setattr(precompile, "usable_cores", lambda: 8)
     assert run(tiny_config, agent) > 0
     assert watched == ["a", "b", "c", "d"]
+
+
+def test_every_part_is_called_until_its_cuda_graph_is_recorded(monkeypatch, watched, tiny_config):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    config = tiny_config(compile="max")
+    precompile.precompile(config, build_agent(config, 5, 1), (1,), (2,))
+    assert watched == [*"abcd"] * 3  # run, recorded, replayed
 
 
 @pytest.mark.parametrize(
