@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("dm_control")
 
+import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from torchrl.envs import GymEnv  # noqa: E402
 
@@ -34,7 +35,26 @@ def test_a_frame_beyond_the_models_limit_is_refused(size):
         render_frame(env, *size)
 
 
-@pytest.mark.parametrize("backend", ["disable", "egl", None])
+@pytest.mark.parametrize(
+    ("task", "options", "height", "width", "camera_id"),
+    [
+        ("pendulum-swingup", {}, 384, 384, 0),
+        ("pendulum-swingup", {"height": 480, "width": 640}, 480, 640, 0),
+        ("quadruped-walk", {"width": 64}, 384, 64, 2),
+        ("quadruped-walk", {"camera_id": 1}, 384, 384, 1),
+    ],
+)
+def test_dm_control_draws_what_was_asked_for(monkeypatch, task, options, height, width, camera_id):
+    env, asked, pixels = make_env(task, seed=0), [], np.full((2, 2, 3), 7, dtype=np.uint8)
+    monkeypatch.setattr(type(env.physics), "render", lambda _, **drawn: asked.append(drawn) or pixels)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    frame = render_frame(env, **options)
+    assert asked == [{"height": height, "width": width, "camera_id": camera_id}]
+    pixels.fill(0)  # a renderer may draw into the same memory again
+    assert (frame == 7).all()
+
+
+@pytest.mark.parametrize("backend", ["disable", "Off", "egl", None])
 @pytest.mark.parametrize("name", ["pendulum-swingup", "gym/InvertedPendulum-v5"])
 def test_a_process_that_cannot_render_says_so_in_one_line(name, backend, monkeypatch):
     if name.startswith("gym/"):
@@ -56,6 +76,7 @@ def test_a_process_that_cannot_render_says_so_in_one_line(name, backend, monkeyp
         render_frame(env)
     reason = {
         "disable": "MUJOCO_GL is 'disable'",
+        "Off": "MUJOCO_GL is 'Off'",
         "egl": "No OpenGL rendering backend is available",
         None: "there is no display",
     }[backend]
