@@ -46,6 +46,15 @@ def test_the_plans_of_all_episodes_of_an_evaluation_are_made_at_once(monkeypatch
         require_memory(TrainConfig(eval_episodes=1000), 24, 6, torch.device("cpu"))
 
 
+def test_a_batch_is_rolled_by_every_dynamics_head(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.training.memory._memory_bytes", lambda device: 4 * 10**9)
+    settings = {"optim": {"batch_size": 100_000}, "model": {"num_dynamics": 1}}
+    require_memory(TrainConfig.from_dict(settings), 24, 6, torch.device("cpu"))
+    settings["model"] = {"num_dynamics": 4}
+    with pytest.raises(ValueError, match=r"^optim\.batch_size would take "):
+        require_memory(TrainConfig.from_dict(settings), 24, 6, torch.device("cpu"))
+
+
 @pytest.mark.parametrize("name", ["efficient-tdmpc", "tdmpc2"])
 def test_weights_count_with_their_targets_gradients_and_moments(monkeypatch, name):
     config = dataclasses.replace(PRESETS[name], replay=ReplayConfig(capacity=10_000, pretrain_policy=name == "tdmpc2"))
