@@ -20,6 +20,7 @@ from torchrl_etdmpc.objectives import (
     TDMPC2Loss,
     Term,
     action_value_target,
+    latent_rollout,
     policy_value,
 )
 from torchrl_etdmpc.testing import random_slices
@@ -332,12 +333,24 @@ def test_the_running_scale_is_that_of_the_slices_that_count(batch):
 
 
 def test_a_prioritised_batch_gets_the_td_errors_of_its_slices(batch):
-    loss = make_loss().eval()
+    model = make_model(num_dynamics=2)
+    loss = make_loss(model).eval()
     batch["priority_weight"] = torch.ones(B, T)
     evaluate(loss, batch)
-    assert batch["td_error"].shape == (B, T)
-    assert (batch["td_error"] > 0).all()
-    assert (batch["td_error"] == batch["td_error"][:, :1]).all()
+    read, drawn = loss.slices(batch), draws(2)
+    rollout = latent_rollout(model, read)
+
+    def target_values(latent, action):
+        with loss.target_value_params.to_module(model.value_head):
+            return model.action_values(latent, action)
+
+    following, heads = rollout.encoded[1:], torch.tensor(drawn.target_heads)
+    target = action_value_target(
+        model, target_values, following, read.reward, None, drawn.target_noise, heads, loss.discount
+    )
+    values = model.action_values(rollout.predicted[:-1], read.action.unsqueeze(1).expand(-1, 2, -1, -1))  # [T, F, B, V]
+    expected = (values - target[:, None, :, None]).abs().mean((0, 1, 3))
+    torch.testing.assert_close(batch["td_error"], expected.unsqueeze(-1).expand(B, T))
 
 
 def test_the_policy_term_can_be_left_out(batch):
