@@ -88,6 +88,9 @@ def test_priorities_are_written_whether_the_weights_count_or_not(make_loss, worl
 @pytest.mark.parametrize("kind", ["whole", "value"])
 def test_a_priority_is_the_mean_distance_of_a_slice_s_values_from_their_targets(make_loss, world_model, slices, kind):
     loss = make_loss(kind, world_model).eval()
+    with torch.no_grad():  # one head above the targets and one below
+        world_model.value_head.output.bias[0, -1] += 2
+        world_model.value_head.output.bias[1, 0] += 2
     torch.manual_seed(7)
     loss(weighted(slices))
     priority = slices["td_error"]
