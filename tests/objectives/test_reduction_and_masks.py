@@ -148,6 +148,8 @@ def test_slices_of_padding_alone_are_as_good_as_not_there(
 def test_a_batch_of_padding_alone_is_a_loss_of_zero_and_moves_nothing(make_loss, world_model, kind, slices, total):
     loss = make_loss(kind, world_model)
     slices["collector", "mask"] = torch.zeros(4, 3, dtype=torch.bool)
+    for key in ("observation", ("next", "observation"), "action", ("next", "reward")):
+        slices[key].fill_(torch.nan)
     out = loss(slices)
     assert total(out) == 0
     total(out).backward()
@@ -306,7 +308,9 @@ def test_masked_steps_leave_gradients_finite_of_an_encoder_that_no_zero_may_ente
     loss = EfficientTDMPCLoss(WorldModel(3, 2, encoder=Direction(), latent_dim=16, mlp_dim=16), discount=0.99).eval()
     SoftUpdate(loss, tau=0.01)
     batch = random_slices(3, 2, num_slices=2, slice_len=3)
-    batch["collector", "mask"] = torch.tensor([[not whole, False, False], [True, True, True]])
+    batch["collector", "mask"] = mask = torch.tensor([[not whole, False, False], [True, True, True]])
+    for key in ("observation", ("next", "observation")):
+        batch[key] = torch.where(mask.unsqueeze(-1), batch[key], 0)
     sum(value for name, value in loss(batch).items() if name.startswith("loss_")).backward()
     assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
     if whole:
