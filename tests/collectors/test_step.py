@@ -726,15 +726,22 @@ def test_what_transforms_remember_outlives_a_simulator_that_cannot_be_restored(w
 
 @pytest.mark.parametrize("lengths", [(9,), (9, 9)], ids=["one-env", "two-envs"])
 @pytest.mark.parametrize("insertion", ["step", "episode"])
-def test_episodes_that_cannot_go_on_are_stored_to_their_last_step_as_truncated_ones(insertion, lengths):
+@pytest.mark.parametrize("message", ["the environment cannot be restored", "the simulator did not come back"])
+def test_episodes_that_cannot_go_on_are_stored_to_their_last_step_as_truncated_ones(
+    message, insertion, lengths, monkeypatch
+):
+    if "simulator" in message:
+        monkeypatch.setattr("torchrl_etdmpc.collectors.step.load_simulator_state", lambda *_: False)
+        monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: {})
     replay = make_replay(sampler=StepSliceSampler(3, partial=True), batch_size=3)
     options = {"replay_buffer": replay, "insertion": insertion}
     first, second = (StepCollector(make_env(lengths), RandomActions(), **options) for _ in range(2))
     for _ in range(5):
         first.step()
     state = first.state_dict()
-    with pytest.warns(UserWarning, match="the environment cannot be restored"):
+    with pytest.warns(UserWarning, match=message):
         second.load_state_dict(state)
+    assert second.begins_fresh
     rows = episodes(replay.storage[:])
     assert [[row["next", "truncated"].item() for row in steps] for steps in rows.values()] == [
         [False] * 4 + [True] for _ in lengths
