@@ -593,7 +593,8 @@ def test_a_transform_that_would_change_what_was_planned_from_comes_first():
     buffer.append_transform(ObservationNorm(**scaled))
     make_reanalyze(buffer)
     buffer.append_transform(DoubleToFloat(in_keys=["action"]))
-    buffer.sample()
+    buffer.append_transform(ObservationNorm(**scaled, out_keys=["scaled"]))  # reads it and leaves it as it is
+    assert "scaled" in buffer.sample()
     late = make_buffer(20)
     make_reanalyze(late)
     late.append_transform(ObservationNorm(**scaled))
@@ -601,6 +602,11 @@ def test_a_transform_that_would_change_what_was_planned_from_comes_first():
     with pytest.raises(RuntimeError, match="ObservationNorm changes 'observation' after reanalyze has planned from it"):
         late.sample()
     assert (content(late) == before).all()
+    other = make_buffer(20)
+    make_reanalyze(other)
+    other.append_transform(ObservationNorm(**(scaled | {"in_keys": ["action"]}), out_keys=["observation"]))
+    with pytest.raises(RuntimeError, match="ObservationNorm changes 'observation' after reanalyze has planned from it"):
+        other.sample()
 
 
 def test_stale_rows_add_up_over_samples():
