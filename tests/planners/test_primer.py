@@ -190,3 +190,11 @@ def test_alone_it_asks_the_environment_for_what_it_reads_and_writes():
         StepCollector(env, planner, replay_buffer=buffer)
     with pytest.raises(KeyError, match="the planner needs 'seen' .* or append what check_env"):
         next(iter(Collector(env, planner, frames_per_batch=2, total_frames=2, auto_register_policy_transforms=True)))
+
+
+def test_an_environment_of_latents_needs_no_observation_unless_latents_are_not_read():
+    planner = make_planner(make_env())
+    planner.make_tensordict_primer().check(planner.env)
+    other = EnsembleMPPIPlanner(planner.env, latent_key=None, **BUDGET)
+    with pytest.raises(ValueError, match="observation is missing"):
+        other.make_tensordict_primer().check(planner.env)
