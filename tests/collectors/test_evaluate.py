@@ -291,3 +291,6 @@ def test_the_policy_alone_is_compared_with_the_environment_too():
         evaluate(env, behind, episodes=1)
     env.append_transform(ActionScaling())
     assert evaluate(env, policy, episodes=1).lengths.tolist() == [200]
+    reading = TensorDictModule(lambda observation: observation, ["observation"], ["other"])
+    part = BarePolicy(policy.world_model, observation_key="other")
+    assert evaluate(env, TensorDictSequential(reading, part), episodes=1).lengths.tolist() == [200]
