@@ -56,19 +56,19 @@ def test_a_wrong_shape_is_named_with_its_method(world, text):
 
 def test_returns_of_a_model_scored_in_half_precision_are_summed_in_full():
     class Rich(LineWorld):
-        """Answers in bfloat16, and pays 100 more for every step than the goal does: few of its sums are exact there."""
+        """Answers in bfloat16, and pays 100.5 for every step, of which three are no number of bfloat16."""
 
         def reward(self, latent: Tensor, action: Tensor) -> Tensor:
-            return (100 + super().reward(latent, action)).bfloat16()
+            return torch.full_like(super().reward(latent, action), 100.5, dtype=torch.bfloat16)
 
         def values(self, latent: Tensor) -> Tensor:
-            return super().values(latent).bfloat16()
+            return torch.zeros_like(super().values(latent), dtype=torch.bfloat16)
 
-    planner = EnsembleMPPIPlanner(
-        LatentEnv(Rich()), horizon=3, num_proposals=0, warm_start=False, scoring_dtype="bfloat16"
-    )
+    options = {"num_proposals": 0, "warm_start": False, "scoring_dtype": "bfloat16", "discount": 1.0}
+    planner = EnsembleMPPIPlanner(LatentEnv(Rich()), horizon=3, **options)
     plan = planner.plan(torch.zeros(4, planner.world_model.observation_dim), trace=True)
     assert plan.value.dtype == torch.float32
     assert plan.trace is not None
-    assert plan.trace.returns.dtype == torch.float32
-    assert not torch.equal(plan.trace.returns.bfloat16().float(), plan.trace.returns)
+    returns = plan.trace.returns
+    assert returns.dtype == torch.float32
+    assert torch.equal(returns, torch.tensor([100.5, 201.0, 301.5]).view(3, 1, 1).expand_as(returns))
