@@ -22,7 +22,7 @@ _MORE = """
 import gymnasium
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from torchrl.envs import ActionScaling, FrameSkipTransform, GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
-from torchrl.envs import CatFrames, ObservationNorm, RewardScaling
+from torchrl.envs import CatFrames, Compose, ObservationNorm, RewardScaling, RewardSum, Transform
 from torchrl.envs.transforms import VecNormV2
 from torchrl_etdmpc.envs import Task, make_env, register_task
 
@@ -59,6 +59,11 @@ def frozen_by_gymnasium():
     env.base_env._env.update_running_mean = False
     return env
 def of_a_suite(): return TransformedEnv(make_env("gym/Pendulum-v1"), RewardScaling(0, 0.1))
+class Paid(Transform):
+    def _apply_transform(self, observation): return observation[..., :1]
+def paid(): return TransformedEnv(make_env("gym/Pendulum-v1"), Paid(in_keys=["observation"], out_keys=["reward"]))
+def sums_what_it_scales():
+    return TransformedEnv(make_env("gym/Pendulum-v1"), Compose(RewardSum(), RewardScaling(0, 0.1)))
 def limited(): return scaled(StepCounter(30))
 def only_told(): return scaled(StepCounter(30, update_done=False), base=GymWrapper(PendulumEnv()))
 def counted(): return scaled(StepCounter(), base=GymWrapper(PendulumEnv()))
@@ -388,14 +393,16 @@ def test_statistics_that_move_in_every_copy_are_refused_unless_they_are_frozen(f
     assert any(isinstance(transform, VecNormV2) for transform in env.transform)
 
 
+@pytest.mark.parametrize(("name", "factor"), [("of_a_suite", 1), ("paid", 1), ("sums_what_it_scales", 10)])
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_the_episode_s_reward_is_the_sum_of_rewards_that_a_transform_has_changed(folder, num_envs):
-    task = import_task("more_tasks:of_a_suite", terminates=False, episode_length=5)
+def test_the_episode_s_reward_is_the_sum_of_rewards_that_a_transform_has_changed(folder, num_envs, name, factor):
+    """Unless a transform of the user's own sums others."""
+    task = import_task(f"more_tasks:{name}", terminates=False, episode_length=5)
     env = make_env(task, seed=0, num_envs=num_envs, parallel=False)
     rollout = env.rollout(12, break_when_any_done=False).reshape(num_envs, 12)
     reward, total = (rollout["next", key].squeeze(-1) for key in ("reward", "episode_reward"))
     for begin in (0, 5, 10):
-        expected = reward[:, begin : begin + 5].cumsum(1)
+        expected = factor * reward[:, begin : begin + 5].cumsum(1)
         torch.testing.assert_close(total[:, begin : begin + 5], expected)
 
 
