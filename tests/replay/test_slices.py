@@ -857,6 +857,15 @@ def test_ids_beside_a_floating_flag_keep_their_last_digit(dtype, first):
     assert (slices == slices[:, :1]).all()
 
 
+def test_ids_beside_a_floating_id_keep_their_last_digit():
+    sampler = StepSliceSampler(3, traj_key=["worker", ("collector", "traj_ids")])
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(40), sampler=sampler, batch_size=300)
+    ids = 2**24 + torch.arange(40) % 2
+    buffer.extend(TensorDict({"collector": {"traj_ids": ids}, "worker": torch.zeros(40)}, [40]))
+    slices = buffer.sample()["collector", "traj_ids"].reshape(-1, 3)
+    assert (slices == slices[:, :1]).all()
+
+
 @pytest.mark.parametrize("how", ["dumps", "state_dict"])
 def test_a_full_buffer_is_rolled_back_in_the_process_that_filled_it(how, tmp_path):
     def write(buffer, begin, number):
