@@ -63,6 +63,14 @@ def test_losses_that_share_a_world_model_count_a_step_once(make_world_model, sli
     assert model.version == 2
 
 
+def test_a_loss_of_other_networks_that_is_built_later_does_not_end_the_count(make_world_model, slices, total):
+    model = make_world_model()
+    loss = EfficientTDMPCModelLoss(model, ignore_termination=True)
+    EfficientTDMPCPolicyLoss(model)
+    train(loss, torch.optim.SGD(loss.parameters(), lr=0.1), slices=slices, total=total)
+    assert model.version == 3
+
+
 def test_optimizers_of_other_networks_do_not_count(loss, world_model):
     other = torch.nn.Linear(2, 2)
     optimizer = torch.optim.SGD(other.parameters(), lr=0.1)
