@@ -499,6 +499,17 @@ def test_rows_added_one_by_one_equal_rows_written_at_once():
     assert apart.every_drawn_slice() == together.every_drawn_slice() == apart.every_valid_slice()
 
 
+def test_what_a_seed_draws_follows_from_the_order_of_writing_and_not_from_the_ids():
+    drawn = []
+    for ids in ([0, 1], [9, 4]):
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=StepSliceSampler(2), batch_size=40)
+        episodes = torch.tensor(ids).repeat_interleave(torch.tensor([3, 7]))
+        buffer.extend(TensorDict({"collector": {"traj_ids": episodes}, "t": torch.arange(10)}, [10]))
+        torch.manual_seed(0)
+        drawn.append(buffer.sample()["t"])
+    assert torch.equal(*drawn)
+
+
 def test_a_memory_mapped_storage_is_sampled_like_one_in_memory(tmp_path):
     ring = Ring(17, 3, storage=lambda capacity: LazyMemmapStorage(capacity, scratch_dir=tmp_path))
     for row in interleaved([5, 8], 2, 44):
