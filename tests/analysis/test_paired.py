@@ -87,6 +87,14 @@ def test_every_task_counts_alike_and_the_bootstrap_is_stratified():
     assert table.loc["All tasks", "pairs"] == 6
 
 
+def test_resamples_of_one_task_are_not_those_of_another():
+    differences = [0.0, 1.0, 2.0, 3.0]
+    runs = pairs([(one, 0.0) for one in differences]) | pairs([(-one, 0.0) for one in differences], "y")
+    row = compare(curves(runs)).loc["All tasks"]  # drawn alike, they would cancel out
+    assert row["difference"] == pytest.approx(0)
+    assert row["lower"] < -0.3 and row["upper"] > 0.3
+
+
 def test_with_a_constant_for_every_task_the_differences_over_tasks_are_normalised_and_no_probability():
     runs = pairs([(1.0, 0.0), (1.0, 2.0), (6.0, 0.0)]) | pairs([(4.0, 0.0), (1.0, 2.0)], "y")
     table = compare(curves(runs), constants=pd.Series({"x": 10.0, "y": 5.0}))
