@@ -437,3 +437,10 @@ def test_a_seed_that_does_not_cover_the_grid_does_not_count():
     table = seed_curves({1: {1e6: 1.0, 2e6: 1.0}, 2: {1e6: 900.0, 1.9e6: 900.0}, 3: {1e6: 3.0, 2e6: 3.0}})
     (row,) = auc_of_seeds(table, np.array([1e6, 2e6])).itertuples()
     assert (row.auc, row.standard_error, row.seeds) == pytest.approx((2.0, 1.0, 2))
+
+
+def test_where_no_seed_covers_the_grid_neither_an_area_nor_a_count_is_known():
+    table = pd.concat([seed_curves({1: {1: 1.0, 9: 1.0}}), seed_curves({1: {1: 1.0, 10: 1.0}}, method="b")])
+    areas = auc_of_seeds(table, np.array([1.0, 10.0])).set_index("method")
+    assert areas.loc["a", ["auc", "seeds"]].isna().all()
+    assert areas.loc["b", "seeds"] == 1
