@@ -11,6 +11,7 @@ import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
 from torchrl_etdmpc.analysis import AGGREGATE, compare_paired  # noqa: E402
+from torchrl_etdmpc.analysis.paired import paired_markdown  # noqa: E402
 
 small = settings(deadline=None, max_examples=15)
 scores = st.lists(st.tuples(st.floats(-100, 100), st.floats(-100, 100)), min_size=2, max_size=5)
@@ -104,6 +105,14 @@ def test_with_a_constant_for_every_task_the_differences_over_tasks_are_normalise
     probabilities = ["improvement", "improvement_lower", "improvement_upper"]
     assert table.loc[AGGREGATE, probabilities].tolist() == pytest.approx(plain[probabilities].tolist())
     assert 0 < plain["improvement_lower"] < plain["improvement"] < plain["improvement_upper"]
+
+
+def test_a_page_has_normalised_differences_with_more_decimals_than_returns():
+    found = compare(curves(pairs([(16.0, 0.0), (8.0, 0.0)])), "x", constants=pd.Series({"x": 100.0}))
+    assert paired_markdown(found.reset_index()).splitlines()[2:] == [
+        "| new | base | x | +12.0 [+8.0, +16.0] | 1.00 [1.00, 1.00] | 2 | 0 |",
+        f"| new | base | {AGGREGATE} | +0.120 [+0.080, +0.160] | 1.00 [1.00, 1.00] | 2 | 0 |",
+    ]
 
 
 def test_one_pair_has_a_difference_and_no_interval():
