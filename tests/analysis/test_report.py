@@ -252,6 +252,13 @@ def test_without_an_area_on_all_tasks_there_is_no_figure_of_areas(without_figure
     assert "(aggregate.png)" in page and "(auc.png)" not in page
 
 
+def test_a_table_of_an_older_report_that_this_one_lacks_is_gone(without_figures, tmp_path):
+    for name in ("paired.csv", "mine.csv"):
+        (tmp_path / name).write_text("of other runs")
+    write_report(comparison(), tmp_path)
+    assert {path.name for path in tmp_path.glob("*.csv")} == {"auc.csv", "final.csv", "returns.csv", "mine.csv"}
+
+
 def test_methods_known_per_seed_on_all_tasks_have_an_interquartile_mean_on_the_page(without_figures, tmp_path):
     page = write_report(comparison(seeds=2), tmp_path / "report").read_text(encoding="utf-8")
     (row,) = re.findall(r"^\| ours \| ([\d.]+) \(([\d.]+) to ([\d.]+)\) \| 2 \|$", page, re.MULTILINE)
@@ -275,6 +282,25 @@ def test_a_row_of_probabilities_is_how_often_its_method_scores_more_than_the_col
     assert "| method | interquartile mean | P(> ours) | P(> BMPC) | seeds per task |" in page
     assert re.search(r"^\| ours \| [^|]+ \|  \| 1\.000 \(1\.000 to 1\.000\) \| 2 \|$", page, re.MULTILINE)
     assert re.search(r"^\| BMPC \| [^|]+ \| 0\.000 \(0\.000 to 0\.000\) \|  \| 2 \|$", page, re.MULTILINE)
+
+
+def test_seeds_that_differ_from_task_to_task_are_said_from_fewest_to_most(without_figures, tmp_path):
+    tasks = ("cartpole-balance", *TASKS)
+    ours = [
+        ("ours", task, seed, step, step + 1.0)
+        for count, task in enumerate(tasks, start=1)
+        for seed in range(count)
+        for step in STEPS
+    ]
+    bmpc = [("BMPC", task, step, step + 1.0, 2.0, 5) for task in tasks for step in STEPS]
+    found = compare(
+        pd.DataFrame(ours, columns=["method", "task", "seed", "env_steps", "return_mean"]),
+        pd.DataFrame(bmpc, columns=["method", "task", "env_steps", "mean", "standard_error", "seeds"]),
+        benchmark=get_benchmark("dmc-easy"),
+        tasks=tasks,
+    )
+    page = write_report(found, tmp_path).read_text(encoding="utf-8")
+    assert "| ours | 1.000 | 1 to 3 |" in page  # one seed has no interval
 
 
 def test_beside_a_mean_over_fewer_tasks_stands_the_first_method_s_over_the_same_ones(without_figures, tmp_path):
