@@ -60,6 +60,15 @@ def test_the_median_of_an_even_number_lies_in_the_middle():
     assert row["median"] == 2.0
 
 
+def test_a_draw_is_won_by_neither_the_planner_nor_the_policy():
+    planned = torch.tensor([3.0, 3.0, 3.0, 2.0, 0.0])
+    result = advantage.Advantage(planned, torch.full((5,), 2.0), torch.zeros(5, 2), 1, 2, torch.arange(5))
+    (row,) = advantage.table(result)
+    shares = [row[name] for name in ("planner_better", "policy_better", "mean_policy")]
+    assert shares == pytest.approx([0.6, 0.2, 2.0])
+    assert advantage.lines(result)[1] == "the planner earned more in 60% of 5 states, the policy in 20%"
+
+
 def test_the_interval_of_a_difference_is_over_episodes():
     episode = torch.arange(40) // 20
     result = advantage.Advantage(episode.float(), torch.zeros(40), torch.zeros(40, 2), 1, 2, episode)

@@ -49,9 +49,10 @@ def test_after_an_end_nothing_is_promised(make_episodes, make_planner):
 def test_the_lines_say_bias_and_scale():
     predicted = torch.stack([torch.arange(12.0) + 1, torch.arange(12.0) - 2], dim=-1)
     result = value_bias.ValueBias(
-        predicted, torch.arange(12.0), torch.zeros(12), torch.arange(12) % 3, torch.arange(12)
+        predicted, torch.arange(12.0), torch.arange(12) / 22, torch.arange(12) % 3, torch.arange(12)
     )
     rows = value_bias.table(result)
+    assert [row["mean_own_share"] for row in rows] == pytest.approx([0.25, 0.25])
     assert [row["bias"] for row in rows] == [1, -2]
     assert [row["correlation"] for row in rows] == pytest.approx([1, 1])
     points = value_bias.figure(result).axes[1].collections[0].get_offsets()
