@@ -48,6 +48,22 @@ def test_a_planner_that_is_pessimistic_is_compared_without(make_episodes, make_p
     assert torch.equal(one.returns, other.returns)
 
 
+def test_the_budget_of_plans_is_the_study_s_own_but_for_proposals_that_the_planner_has_none_of(
+    make_episodes, make_planner, WorldSimulator
+):
+    world = LineWorld(num_dynamics=2, policy_gain=0.5)
+    states = choose_states(make_episodes(world, world.optimal_action), 4, ahead=3)
+
+    def found(wanted: int, **settings):
+        planner = make_planner(world, **settings)
+        options = {"num_samples": 16, "num_elites": 4, "iterations": 1, "num_proposals": wanted}
+        return cross_scoring.cross_scoring(planner, states, WorldSimulator(world), **options).returns
+
+    assert torch.equal(found(3), found(3, extra_iterations=4, large_action_dim=0))
+    assert torch.equal(found(0), found(3, num_proposals=0))
+    assert not torch.equal(found(0), found(3))
+
+
 def test_an_agent_of_one_head_has_no_ensemble_to_compare_with(make_episodes, make_planner, WorldSimulator):
     world = LineWorld(num_dynamics=1, num_values=1)
     states = choose_states(make_episodes(world, world.optimal_action), 2, ahead=3)
@@ -75,11 +91,23 @@ def test_the_table_has_an_interval_around_every_gain():
     assert sorted(bars) == pytest.approx(sorted(row["gain"] for row in rows))
 
 
-def test_the_median_of_an_even_number_lies_in_the_middle():
+def test_the_median_of_an_even_number_lies_in_the_middle_and_the_error_is_that_of_a_sample():
     returns = torch.zeros(4, 3, 3)
     returns[:, :2] = torch.tensor([0.0, 1.0, 3.0, 100.0]).view(4, 1, 1)
     rows = cross_scoring.table(cross_scoring.CrossScores(returns, 1.0, torch.arange(4)))
     assert {row["median"] for row in rows} == {2.0}
+    assert [row["standard_error_over_states"] for row in rows] == pytest.approx([24.67] * 6, abs=0.01)
+
+
+def test_the_lines_set_what_is_believed_beside_what_is_true():
+    gains = torch.tensor([[3.0, 2.0, 1.0], [6.0, 5.0, 4.0], [0.0, 0.0, 0.0]])
+    result = cross_scoring.CrossScores(gains.expand(4, 3, 3), 10.0, torch.arange(4))
+    assert cross_scoring.lines(result) == [
+        "planned with single head: believes in +30.0 per episode over the policy, the simulator gives +10.0 "
+        "[+10.0, +10.0]",
+        "planned with ensemble: believes in +50.0 per episode over the policy, the simulator gives +40.0 "
+        "[+40.0, +40.0]",
+    ]
 
 
 def test_the_interval_of_a_gain_is_over_episodes():
