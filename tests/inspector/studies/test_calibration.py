@@ -40,6 +40,8 @@ def test_heads_that_are_apart_where_they_are_wrong_are_calibrated(measure):
     for row in first:
         assert row["rank_correlation"] == pytest.approx(1, abs=0.01)
         assert row["error_over_disagreement"] == pytest.approx(3, rel=1e-3)
+    said = [line.partition(":")[0] for line in calibration.lines(result)]
+    assert said == [f"{kind} actions, depth {depth}" for kind in ("planned", "random") for depth in (1, 2)]
     points = calibration.figure(result).axes[0].collections[0].get_offsets()
     assert points.tolist() == torch.stack([result.disagreement[:, 0, 0], result.error[:, 0, 0]], dim=-1).tolist()
 

@@ -78,12 +78,12 @@ def test_candidates_without_a_finite_score_have_no_weights(make_episodes, make_p
 
 def test_the_table_names_every_weight_and_the_lines_the_mean_depth():
     weights = torch.tensor([[0.5, 0.5], [0.0, 1.0]]).expand(6, 1, 2, 2)  # two iterations of two depths
-    result = horizon_weights.HorizonWeights(
-        weights, torch.ones(6, 1, 2), torch.ones(6, 1, 2), (3.0,), torch.arange(6) % 3
-    )
+    mean, sigma = torch.tensor([1.0, 2.0]).expand(6, 1, 2), torch.tensor([3.0, 4.0]).expand(6, 1, 2)
+    result = horizon_weights.HorizonWeights(weights, mean, sigma, (3.0,), torch.arange(6) % 3)
     rows = horizon_weights.table(result)
     assert [row["weight"] for row in rows] == [0.5, 0.5, 0.0, 1.0]
-    assert [row["mean"] for row in rows] == ["", "", 1.0, 1.0]
+    assert [row["mean"] for row in rows] == ["", "", 1.0, 2.0]
+    assert [row["sigma"] for row in rows] == ["", "", 3.0, 4.0]
     assert horizon_weights.lines(result) == [
         "beta 3: mean depth 1.50 in the first iteration, 2.00 in the last, change +0.50 [+0.50, +0.50]"
     ]

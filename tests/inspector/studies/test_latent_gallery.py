@@ -83,3 +83,18 @@ def test_states_in_which_the_heads_agree_exactly_are_left_out_of_the_ratio(make_
     assert said[0].endswith("geometric mean: 2.00 [2.00, 2.00]")
     without = latent_gallery.lines(result._replace(imagined=torch.zeros_like(imagined)))
     assert not any(line.startswith("spread of the heads") for line in without)
+
+
+def test_the_lines_say_what_the_last_beta_costs_and_the_table_has_every_value_within_its_interval():
+    latents, returns = torch.rand(6, 2, 2, 4, 2), torch.rand(6, 2, 3, 2, 2)
+    true = torch.tensor([[1.0, 2.0, 5.0], [1.0, 2.0, 3.0]]).expand(6, 2, 3)
+    episode = torch.arange(6) % 3
+    result = latent_gallery.LatentGallery(latents, latents[:, :, 0], returns, true, (0.0, 10.0), episode)
+    assert latent_gallery.lines(result)[-1] == (
+        "true return of the whole plan, beta 10 minus beta 0: -2.000 [-2.000, -2.000]"
+    )
+    rows = latent_gallery.table(result)
+    estimates = [row["estimated_return"] for row in rows]
+    assert estimates == pytest.approx(returns.mean((0, 3, 4)).flatten().tolist())
+    for name in ("spread", "error", "deviation", "estimated_return"):
+        assert all(row[f"{name}_low"] < row[name] < row[f"{name}_high"] for row in rows)
