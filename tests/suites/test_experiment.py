@@ -160,6 +160,10 @@ def test_settings_of_the_command_come_after_those_of_every_variant(write):
         ({"budget": -1}, "budget of .* must be a number of env steps or 'benchmark', got -1."),
         ({"budget": 1000.5}, "budget of .* must be a number of env steps or 'benchmark', got 1000.5."),
         ({"base": "three"}, "base of experiment mine must be one of one, two heads, got 'three'."),
+        (
+            {"variants": {"one": {}, "tuned": {"search": {"loss.rho": [0.4]}, "trials": 1}}, "base": "tuned"},
+            "base of experiment mine must be one of one, got 'tuned'.",
+        ),
         ({"what": 1}, "mine.yaml has an unknown entry what; known: base, budget, seeds, "),
     ],
 )
