@@ -44,6 +44,12 @@ def test_the_time_left_is_that_of_what_is_left(small, tmp_path):
     assert status_text(runs, progress, workers=2).endswith("about 1 h 30 min left with 2 at a time")
 
 
+def test_one_run_of_an_unusual_speed_does_not_move_the_time_left_of_those_that_wait(small, tmp_path):
+    runs = small.experiment(seeds=(1, 2, 3, 4), budget=360_000).runs(tmp_path)
+    done = [Progress("finished", 360_000, 1.0, speed) for speed in (50.0, 50.0, 5_000.0)]
+    assert status_text(runs, [*done, Progress("waiting")]).endswith("about 1 h 0 min left with 1 at a time")
+
+
 def test_runs_that_are_running_share_the_time_left(small, tmp_path):
     runs = small.experiment(seeds=(1, 2), budget=720_000).runs(tmp_path)
     progress = [Progress("running", 360_000, 1.0, 50.0)] * 2
