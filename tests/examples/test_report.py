@@ -472,6 +472,20 @@ def test_runs_on_a_task_of_no_benchmark_say_where_they_are_compared(run_main, ca
     assert "up to 10,000 env steps, compared at 2,000, which all of them reach; 1 missing" in capfd.readouterr().out
 
 
+def test_runs_that_end_at_the_benchmark_s_budget_have_its_usual_grid(run_main):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 200_001, 50_000))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs", "--reference")
+    assert "grid of the AUC: 0 to 200,000 every 100,000 env steps" in Path("report", "index.md").read_text()
+
+
+def test_a_budget_of_one_usual_step_has_a_finer_grid(run_main):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 100_001, 20_000))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs", "--reference", "--budget", "100000")
+    assert "grid of the AUC: 0 to 100,000 every 20,000 env steps" in Path("report", "index.md").read_text()
+
+
 def test_a_budget_that_the_usual_step_does_not_divide_has_another_one(run_main):
     rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 250_001, 50_000))
     make_run("runs/a", text=HEADER + "".join(rows))
@@ -679,6 +693,19 @@ def test_missing_and_unfinished_runs_are_named_on_the_page_and_in_the_line_and_s
     assert "## Missing and unfinished runs\n\n" + "".join(f"- {line}\n" for line in named) in page
     assert float(read_table(Path("report", "final.csv"))["walker-walk"]["a"]) == 52  # of the seed that is there
     assert [(row["pairs"], row["left_out"]) for row in read_rows("paired.csv")] == [("1", "1"), ("1", "2"), ("2", "3")]
+
+
+def test_a_run_that_ends_a_step_before_the_budget_of_the_comparison_is_named(run_main, capfd):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in (0, 50_000, 99_000))
+    make_run("runs/short", seed=2, text=HEADER + "".join(rows))
+    make_run("runs/whole", text=HEADER + ROWS.format(seed=1))
+    run_main("runs", "--budget", "100000", "--reference")
+    assert "; 1 missing or unfinished (cpu on walker-walk with seed 2: ends at 99,000 env" in capfd.readouterr().out
+
+
+def test_of_many_missing_runs_the_line_names_five():
+    assert report.missing(list("abcde")) == "; 5 missing or unfinished (a; b; c; d; e)"
+    assert report.missing(list("abcdefg")) == "; 7 missing or unfinished (a; b; c; d; e; and 2 more)"
 
 
 def test_a_plan_that_no_run_has_reached_yet_is_compared_where_all_are(run_main, capfd):
