@@ -294,6 +294,17 @@ def test_the_picture_of_a_run_is_of_sensible_size_even_with_a_nan_return(tmp_pat
     assert sorted(file.name for file in tmp_path.iterdir()) == [".lock", "config.yaml", "curve.png", "eval.csv"]
 
 
+def test_the_picture_of_a_run_has_its_means_and_a_deviation_to_both_sides(tmp_path, run_log, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: (drawn.extend(figure.axes), path.write_bytes(b"")))
+    evaluate(run_log, 10.0, 300.0, 200.0)
+    plot_run(tmp_path)
+    assert drawn[0].lines[0].get_xydata().tolist() == [[0, 10], [1000, 300], [2000, 200]]
+    assert {tuple(corner) for corner in interval_corners(drawn[0])} == {
+        *((0, 8), (0, 12), (1000, 298), (1000, 302), (2000, 198), (2000, 202))
+    }
+
+
 def test_a_single_evaluation_without_a_spread_is_drawn_too(tmp_path, run_log):
     evaluate(run_log, -31.0, std=math.nan)
     assert png_size(plot_run(tmp_path)) == (960, 600)
