@@ -90,6 +90,18 @@ def test_a_planner_that_reads_no_plan_before_is_refused(world, make_episodes, ma
         consistency.consistency(make_planner(world, initial="policy"), states)
 
 
+def test_a_page_says_how_many_plans_moved_by_less_than_one_deviation():
+    change = torch.tensor([[0.5, 9.0], [0.9, 9.0], [0.2, 9.0], [4.0, 9.0]]).unsqueeze(1).expand(-1, 3, -1)
+    std = torch.tensor([1.0, 2.0]).expand(4, -1)
+    result = consistency.Consistency(change, std, torch.arange(4) // 2)
+    rows = consistency.table(result)
+    assert [row["within_one_std"] for row in rows] == [0.75, 0.0] * 3
+    assert [row["std"] for row in rows] == [1.0, 2.0] * 3
+    said = consistency.lines(result)
+    assert [line.partition(",")[0] for line in said] == list(consistency.COMPARED)
+    assert said[0].endswith("moved by 1.40 std [0.70, 2.10], in 75% of the states by less than one")
+
+
 def test_the_interval_of_a_change_is_over_episodes():
     episode = torch.arange(40) // 20
     change = episode.view(40, 1, 1).expand(-1, 3, 2).float()
