@@ -23,6 +23,9 @@ def test_many_states_are_planned_as_few_are(make_planner):
     assert plan.action.shape == (70, 1)
     assert plan.trace.actions.shape == (70, 6, 256, 3, 1)
     assert torch.equal(best_sequences(plan)[:, 0], plan.action)  # in evaluation the best one acts
+    estimates = return_estimates(planner, observation, plan.mean.unsqueeze(1))
+    alone = return_estimates(planner, observation[-1:], plan.mean[-1:].unsqueeze(1))
+    assert torch.allclose(estimates[-1:], alone)
     again = replan(planner, observation, generator=generator_of(planner, 0))
     assert torch.equal(again.mean, plan.mean)
     assert again.trace is None
