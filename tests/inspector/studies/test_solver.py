@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_etdmpc.functional import adaptive_mixture
+from torchrl_etdmpc.functional import adaptive_mixture, ensemble_mean
+from torchrl_etdmpc.inspector.settings import with_settings
 from torchrl_etdmpc.inspector.studies import choose_states, gradient_mixture, solver
+from torchrl_etdmpc.inspector.studies.replan import generator_of, replan
 from torchrl_etdmpc.testing import LineWorld
 
 
@@ -55,3 +57,26 @@ def test_the_study_reports_gap_agreement_and_time_of_a_planner_s_candidates(make
     axes = solver.figure(result).axes
     assert [len(axis.lines) for axis in axes] == [3, 3]
     assert axes[0].lines[0].get_ydata().tolist() == result.gap[0, 0].tolist()
+
+
+def test_the_gap_is_in_deviations_of_the_candidates_and_every_number_of_iterations_has_its_own(monkeypatch):
+    monkeypatch.setattr(solver, "_seconds", lambda call: 1.0)
+    torch.manual_seed(0)
+    mean, std = torch.randn(4, 16, 3).double(), torch.rand(4, 16, 3).double() + 0.1
+    iterations = (1, 10, 300)
+    gap, same, *_ = solver.compare(mean, std, 1.0, iterations)
+    assert gap.shape == same.shape == (2, 3)
+    assert (gap[:, 0] > gap[:, 1]).all() and (gap[:, 1] > gap[:, 2]).all()
+    larger, *_ = solver.compare(100 * mean, 100 * std, 1.0, iterations)
+    assert torch.allclose(larger, gap, rtol=1e-3, atol=1e-6)
+
+
+def test_the_candidates_are_those_of_the_last_iteration(make_episodes, make_planner, monkeypatch):
+    given = []
+    monkeypatch.setattr(solver, "compare", lambda mean, *rest: given.append(mean) or (mean,) * 5)
+    world = LineWorld(num_dynamics=2, drift=[[0.1], [-0.1]], policy_gain=1.0)
+    states, planner = choose_states(make_episodes(world, world.optimal_action), 4), make_planner(world)
+    solver.solver(planner, states, betas=(1.0,), horizon=3, seed=2)
+    searcher = with_settings(planner, score="adaptive", beta=1.0)
+    returns = replan(searcher, states.observation, generator=generator_of(planner, 2), trace=True).trace.returns
+    assert torch.equal(given[0], ensemble_mean(returns[:, -1].double()))
