@@ -199,6 +199,19 @@ def test_a_node_that_cannot_begin_a_run_is_tried_again_and_named(fake, small, tm
     assert read_progress(run).error.startswith("cannot be started: No space left on device")
 
 
+def test_a_run_that_is_cancelled_is_asked_to_save_itself(small, tmp_path, monkeypatch):
+    told = []
+
+    def poll():
+        raise KeyboardInterrupt
+
+    process = SimpleNamespace(poll=poll, terminate=lambda: told.append(1), wait=lambda: 75)
+    monkeypatch.setattr(ray_engine, "start", lambda run, threads: process)
+    (run,) = small.experiment().runs(tmp_path)
+    assert ray_engine._train(run, 1) == 75
+    assert told == [1]
+
+
 def test_an_address_where_nobody_answers_is_named_at_once(small, tmp_path):
     pytest.importorskip("ray")
     with socket.socket() as free:
