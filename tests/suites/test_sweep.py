@@ -164,12 +164,12 @@ def test_a_search_goes_on_with_what_was_running_and_repeats_nothing(search, smal
 
 
 def test_a_process_that_is_killed_while_it_proposes_leaves_a_search_that_goes_on(search, small, tmp_path, in_copy):
-    Sweep(search(trials=3), "tuned", tmp_path).propose()
+    Sweep(search(trials=2), "tuned", tmp_path).propose()
 
     def die() -> None:
         import optuna
 
-        sweep = Sweep(search(trials=3), "tuned", tmp_path)
+        sweep = Sweep(search(trials=2), "tuned", tmp_path)
         suggest = optuna.trial.Trial._suggest
 
         def after_one(trial, name, distribution):
@@ -181,11 +181,11 @@ def test_a_process_that_is_killed_while_it_proposes_leaves_a_search_that_goes_on
         sweep.propose()
 
     assert os.WIFSIGNALED(in_copy(die))
-    sweep = Sweep(search(trials=3), "tuned", tmp_path)
+    sweep = Sweep(search(trials=2), "tuned", tmp_path)
     assert len(sweep.runs()) == 1
     train(small, sweep)
     values = [trial.value for trial in study_of(tmp_path).trials]
-    assert len([value for value in values if value is not None]) == 3
+    assert len([value for value in values if value is not None]) == 2
 
 
 def test_two_processes_that_share_a_search_close_each_trial_once(search, small, tmp_path):
