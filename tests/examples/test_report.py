@@ -786,6 +786,17 @@ def test_runs_that_spell_out_what_the_task_has_anyway_are_not_changed_ones(run_m
     assert "BMPC |" in page
 
 
+def test_what_a_run_changes_of_one_task_is_said_whatever_it_does_on_others(run_main):
+    make_run("runs/a")
+    make_run("runs/b", task="walker-stand")
+    with open("runs/a/config.yaml", "a") as file:
+        file.write("episode_length: 100\n")
+    run_main("runs", "--reference")
+    page = Path("report", "index.md").read_text()
+    assert "- walker-walk was run with episode_length=100, not as the benchmark has it.\n" in page
+    assert "walker-stand was run with" not in page
+
+
 def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
     make_run("runs/a")
     with open("runs/a/config.yaml", "a") as file:
