@@ -13,6 +13,7 @@ from torchrl_etdmpc import commands
 from torchrl_etdmpc.commands import suite
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.suites import RunQueue, read_experiment, write_experiment
+from torchrl_etdmpc.suites.attempt import note
 
 SMALL = {"preset": "cpu", "device": "cpu", "task.episode_length": 200, "replay.seed_decisions": 40}
 MINE = {
@@ -143,6 +144,8 @@ def test_a_dry_run_says_what_would_be_run_and_changes_nothing(call, mine, tmp_pa
     assert f"run_dir={tmp_path}/here/b/cup-catch/seed2" in lines[3]
     assert "loss.rho=0.4" in lines[3]
     assert lines[-1] == "4 runs, 1,600 env steps"
+    _, longer = call(f"experiment={mine(variants={'a': {}, 'b': {'total_env_steps': 600}})}", "dry_run=true")
+    assert longer.splitlines()[-1] == "4 runs, 2,000 env steps"
     assert not (tmp_path / "here").exists()
     search = {"search": {"optim.lr": [1e-3, 1e-4]}, "trials": 7}
     _, out = call(f"experiment={mine(variants={'tuned': search})}", "dry_run=true")
@@ -174,6 +177,12 @@ def test_a_setting_of_the_command_makes_no_two_variants_one_run(call, experiment
         assert "leave those out, or write variants=" in str(message)
         message, _ = call(f"experiment={experiment}", "preset=cpu", f"variants={twins[0]}", "seeds=1", "dry_run=true")
         assert message is None
+
+
+def test_presets_that_come_to_the_same_settings_are_one_run(call, mine):
+    twins = {"a": {"preset": "efficient-tdmpc-utd4", "reanalyze.beta": 10.0}, "b": {"preset": "humanoidbench"}}
+    message, _ = call(f"experiment={mine(variants=twins)}", "dry_run=true")
+    assert str(message).startswith("error: variants 'a' and 'b' of experiment mine have the same settings on cup-catch")
 
 
 def test_trials_of_a_search_may_be_the_same_run(call, mine, trained, tmp_path):
@@ -243,6 +252,15 @@ def test_the_status_is_that_of_the_runs_that_are_named(call, mine, trained):
     )
 
 
+def test_the_status_shares_the_time_left_among_as_many_as_will_run(call, mine, monkeypatch, tmp_path):
+    monkeypatch.setattr(suite, "run_locally", lambda queue, **places: True)
+    call(f"experiment={mine()}", "runs_dir=here")
+    run = tmp_path / "here" / "a" / "cup-catch" / "seed1"
+    run.mkdir(parents=True)
+    (run / "train.csv").write_text("env_steps,decision_steps,updates,wall_time_s\n100,50,0,9\n200,100,0,18\n")
+    assert call("status", "runs_dir=here", "workers=3")[1].endswith(" left with 3 at a time\n")
+
+
 def test_a_run_that_fails_makes_the_command_fail(call, mine, monkeypatch):
     def fail(queue, **places):
         while (run := queue.next()) is not None:
@@ -264,6 +282,34 @@ def test_runs_that_are_left_make_the_command_fail(call, mine, monkeypatch):
     monkeypatch.setattr(suite, "run_locally", lambda queue, **places: True)
     message, _ = call(f"experiment={mine()}", "runs_dir=here")
     assert message == 1
+
+
+def test_a_trial_that_ended_early_is_no_failure(call, mine, monkeypatch):
+    def prune(queue, **places):
+        while (run := queue.next()) is not None:
+            note(run, "pruned", "below the median")
+        return True
+
+    monkeypatch.setattr(suite, "run_locally", prune)
+    message, out = call(f"experiment={mine()}", "runs_dir=here")
+    assert message == 0
+    assert out.splitlines()[-1] == "4 runs: 4 pruned"
+
+
+@pytest.mark.parametrize(
+    ("engine", "settings"),
+    [
+        ("run_locally", {"workers": 3, "per_gpu": 2}),
+        ("run_on_ray", {"workers": 3, "address": "node:6379", "cpus_per_run": 2.0, "gpus_per_run": 0.5}),
+    ],
+)
+def test_settings_of_an_engine_reach_it(call, mine, monkeypatch, engine, settings):
+    given = {}
+    monkeypatch.setattr(suite, engine, lambda queue, **places: given.update(places) or True)
+    words = [f"{name}={value}" for name, value in settings.items()] + ["engine=ray"] * (engine == "run_on_ray")
+    _, out = call(f"experiment={mine()}", "runs_dir=here", *words)
+    assert given == settings
+    assert "4 runs: 4 waiting" in out
 
 
 def test_a_suite_that_is_stopped_says_so_with_the_code_for_later(call, mine, monkeypatch):
@@ -297,6 +343,7 @@ def test_a_search_goes_on_by_its_folder_alone(call, mine, monkeypatch):
         message, out = call(*filter(None, (begin, "runs_dir=here", "seeds=1")))
         assert message == 75
         assert "1 runs: 1 waiting" in out
+        assert "tuned: no trial is finished" in out.splitlines()
 
 
 def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
@@ -312,6 +359,18 @@ def test_slurm_gets_the_runs_that_are_left(call, mine, trained, tmp_path):
     call(f"experiment={mine()}", "runs_dir=here")
     message, out = call(f"experiment={mine()}", "engine=slurm", "runs_dir=here")
     assert out == "mine: all 4 runs are finished; nothing to do\n"
+
+
+def test_slurm_gets_a_run_that_was_stopped_or_failed_and_tries_it_as_often_as_told(call, mine, tmp_path):
+    pick = f"experiment={mine()}", "variants=a", "runs_dir=here"
+    for seed in (1, 2):
+        (tmp_path / "here" / "a" / "cup-catch" / f"seed{seed}").mkdir(parents=True)
+    folder = tmp_path / "here" / "a" / "cup-catch"
+    (folder / "seed1" / "suite.log").write_text("suite: failed: the simulator is gone\n")
+    (folder / "seed2" / "train.csv").write_text("env_steps,decision_steps,updates,wall_time_s\n200,100,0,9.0\n")
+    _, out = call(*pick, "engine=slurm", "retries=5")
+    assert out.startswith("2 runs; submit them: sbatch ")
+    assert '[ "$tries" -gt 5 ]' in (tmp_path / "here" / "slurm.sh").read_text()
 
 
 # -- bad input --------------------------------------------------------------------------------------------------------
