@@ -82,6 +82,7 @@ def made(folder: Path, name: str) -> None:
     assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     about = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
     assert (about["study"], about["task"], about["seed"]) == (name, "cartpole-balance", 4)
+    assert (about["trained_env_steps"], about["episodes"], about["states_asked"]) == (400, 2, 6)
     assert len(about["checkpoint_sha256"]) == 64
     assert about["versions"]["torch"]
     assert len(about["lines"]) >= 1
@@ -253,6 +254,15 @@ def test_values_are_asked_for_in_the_first_half_of_an_episode(checkpoint, study)
     assert message is None
     steps = np.load(Path("st", "value_bias.npz"))["step"]
     assert sorted({*steps.tolist()}) == list(range(16))  # of 30, so that 15 follow
+
+
+def test_whole_plans_fit_into_the_rest_of_the_episode(checkpoint, study):
+    few = ("task.episode_length=10", "episodes=2", "states=40", "device=cpu")
+    message, _, _ = study("latent_gallery", f"checkpoint={checkpoint}", *few, "out=st")
+    assert message is None
+    returns = np.load(Path("st", "latent_gallery.npz"))["true_returns"]
+    assert returns.shape == (2 * 4, 2, 2)  # four of five decisions, of which two are planned
+    assert np.isfinite(returns).all()
 
 
 def test_episodes_that_end_early_count_as_long_as_they_were(tmp_path, study):
