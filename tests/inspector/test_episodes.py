@@ -198,6 +198,15 @@ def test_rolling_the_episodes_own_actions_gives_the_episode(walk):
     assert not rolled.terminated
 
 
+def test_the_starts_of_two_episodes_are_two_places(walk):
+    other = play_episode(BarePolicy(small_model("walker-walk")), "walker-walk", seed=4, steps=1)
+    simulator = Simulator("walker-walk")
+    for episode in (walk, other, walk):
+        simulator.restore(episode.states[0])
+        assert torch.equal(simulator.observation, episode.observation[0])
+        assert torch.equal(simulator.roll(episode.action[:1]).observation, episode.observation[:2])
+
+
 def test_a_state_of_another_task_is_refused(walk):
     simulator = Simulator("reacher-easy")
     with pytest.raises(ValueError, match="state cannot be restored: it is not one of task 'reacher-easy'; make"):
