@@ -10,7 +10,7 @@ pytest.importorskip("gymnasium")
 
 from torchrl_etdmpc.envs import get_task  # noqa: E402
 from torchrl_etdmpc.inspector import Cancelled, play_episode, trace_plan, with_settings  # noqa: E402
-from torchrl_etdmpc.inspector.inspection import Inspection, State  # noqa: E402
+from torchrl_etdmpc.inspector.inspection import KEPT, Inspection, Job, State  # noqa: E402
 from torchrl_etdmpc.modules import WorldModel  # noqa: E402
 from torchrl_etdmpc.planners import EnsembleMPPIPlanner, LatentEnv  # noqa: E402
 
@@ -133,7 +133,24 @@ def test_a_trace_that_others_are_drawn_like_is_kept(inspection):
     held = job.future.result()
     *_, last = (inspection.plan(State(0, 0), like=held, seed=seed) for seed in range(20))  # more than are kept
     assert held in inspection.traces
+    assert len(inspection.traces) == KEPT
     assert np.array_equal(last["basis"], inspection.traces[held]["basis"])
+
+
+def test_a_played_episode_is_told_by_its_decisions(inspection, monkeypatch):
+    told = []
+    monkeypatch.setattr(Job, "tell", lambda job, done, of: told.append((job.what, done, of)))
+    inspection.plan(State(3, 0))
+    played = [(done, of) for what, done, of in told if what == "playing episode 3"]
+    assert played == [(iteration // 2, 6) for iteration in range(1, 13)]  # two for a decision
+
+
+def test_a_closed_inspection_leaves_no_simulator_open():
+    inspection = Inspection(make(), TASK, steps=2)
+    inspection.plan(State(0, 0))
+    env = inspection.simulator.env
+    inspection.close()
+    assert env.is_closed
 
 
 def test_an_episode_can_be_played_by_the_policy():
