@@ -38,6 +38,14 @@ def test_a_new_argument_of_a_subclass_appears_by_itself_and_can_be_changed():
     assert (changed.greed, changed.horizon, planner.greed) == (0.75, 2, 0.25)
 
 
+def test_a_subclass_s_own_default_counts():
+    class Far(EnsembleMPPIPlanner):
+        def __init__(self, env: LatentEnv, *, horizon: int = 9, **kwargs) -> None:
+            super().__init__(env, horizon=horizon, **kwargs)
+
+    assert settings_of_class(Far)["horizon"].default == 9
+
+
 def test_an_argument_that_is_not_keyword_only_is_kept_too():
     class Positional(EnsembleMPPIPlanner):
         def __init__(self, env: LatentEnv, greed: float = 0.5, **kwargs) -> None:
