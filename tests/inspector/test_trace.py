@@ -56,6 +56,8 @@ def test_a_trace_holds_the_planner_s_own_numbers():
 @pytest.mark.parametrize("explore", [False, True])
 def test_the_chosen_sequence_begins_with_the_planner_s_action(choice, explore):
     planner = make(first_action=choice, eval_first_action=choice)
+    for weight in planner.world_model.parameters():  # those of rewards and values are zeros at first
+        torch.nn.init.normal_(weight, std=0.3)
     trace = trace_plan(planner, OBSERVATION, explore=explore, seed=2)
     loc = plan_of(planner, 2, explore=explore).loc[0].numpy()
     assert np.array_equal(trace["chosen_actions"][0], loc)
