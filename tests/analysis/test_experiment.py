@@ -82,6 +82,11 @@ def test_unfinished_runs_and_those_that_end_early_are_named(tmp_path):
     assert len(lines) == 4
 
 
+def test_a_run_with_nothing_but_the_untrained_agent_is_named(tmp_path):
+    make_run(tmp_path, "a", 1, last=0)
+    assert incomplete_runs(read(tmp_path)) == ["a on walker-walk with seed 1: no evaluation after 0 env steps"]
+
+
 def test_a_run_that_is_a_step_short_of_its_budget_is_whole_and_one_that_is_a_tenth_short_is_not(tmp_path):
     root = plan(tmp_path, variants=["a"], seeds=[1, 2])
     make_run(root, "a", 1), make_run(root, "a", 2)
