@@ -93,6 +93,10 @@ def test_quoted_points_stand_at_their_step_only_and_have_no_interval():
     assert set(found.xs("paper").index.get_level_values("env_steps")) == {50}  # 40 is no step of the table
 
 
+def test_a_quote_on_a_task_that_is_not_compared_counts_nowhere():
+    pd.testing.assert_frame_equal(table(pd.concat([POINTS, quote("paper", "z", 50, 1000.0)])), table())
+
+
 def test_quotes_on_both_sides_of_a_step_are_not_joined():
     points = pd.concat([quote("paper", "x", 10, 1.0), quote("paper", "x", 30, 3.0)])
     assert "paper" not in table(points).index.get_level_values("method")
