@@ -197,6 +197,18 @@ def test_only_finished_runs_are_remembered_and_read_again_when_they_change(runs,
     assert known.read(longer)[0].state == "stopped"
 
 
+@pytest.mark.parametrize("name", ["summary.json", "eval.csv", "train.csv", ".lock", "suite.log"])
+def test_a_finished_run_is_read_again_when_any_of_its_files_changes(runs, small, tmp_path, read_again, name):
+    small.write_finished(runs[0])
+    known = RunIndex(tmp_path / "index.sqlite")
+    known.read(runs)
+    read_again()
+    (runs[0].path / name).touch()
+    os.utime(runs[0].path / name, ns=(1, time.time_ns() + 10**9))
+    known.read(runs)
+    assert runs[0].name in read_again()
+
+
 def test_a_run_whose_summary_was_removed_is_not_remembered_as_finished(runs, small, tmp_path):
     small.write_finished(runs[0])
     known = RunIndex(tmp_path / "index.sqlite")
