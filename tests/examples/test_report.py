@@ -473,10 +473,10 @@ def test_runs_on_a_task_of_no_benchmark_say_where_they_are_compared(run_main, ca
 
 
 def test_runs_that_end_at_the_benchmark_s_budget_have_its_usual_grid(run_main):
-    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(0, 200_001, 50_000))
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(50_000, 200_001, 50_000))
     make_run("runs/a", text=HEADER + "".join(rows))
     run_main("runs", "--reference")
-    assert "grid of the AUC: 0 to 200,000 every 100,000 env steps" in Path("report", "index.md").read_text()
+    assert "grid of the AUC: 100,000 to 200,000 every 100,000 env steps" in Path("report", "index.md").read_text()
 
 
 def test_a_budget_of_one_usual_step_has_a_finer_grid(run_main):
@@ -593,6 +593,7 @@ def test_the_home_directory_may_be_short(monkeypatch, tmp_path, run_main, capfd)
     make_run("my runs/a")
     run_main("~/my runs", "--out", "~/a report", "--reference")
     assert (tmp_path / "a report" / "index.md").is_file()
+    assert report.named("mine=~/my runs") == ("mine", f"{tmp_path}/my runs")
 
 
 def make_experiment(root: str = "runs/exp", *, seeds: tuple[int, ...] = (1, 2)) -> Path:
@@ -668,6 +669,16 @@ def test_a_variant_has_its_name_from_within_its_folder_too(run_main, monkeypatch
     monkeypatch.chdir(root / "b")
     run_main(".")
     assert "b" in read_table(Path("report", "final.csv"))["walker-walk"]
+
+
+def test_methods_that_share_no_run_are_not_paired_and_a_note_says_so_where_it_was_asked_for(run_main):
+    make_run("runs/a")
+    make_run("runs/b", seed=2)
+    for asked, note in (((), False), (("--paired", "a"), True)):
+        run_main("a=runs/a", "b=runs/b", "--reference", *asked)
+        page = Path("report", "index.md").read_text()
+        assert ("b shares no task and seed with a: not paired." in page) == note
+    assert not Path("report", "paired.csv").exists()
 
 
 def test_a_base_that_is_no_name_of_runs_is_refused(refused):
