@@ -39,7 +39,7 @@ def submit(tmp_path, monkeypatch):
             "SLURM_JOB_ID": str(71 + index),
             "SLURM_CPUS_PER_TASK": "3",
         }
-        return subprocess.Popen(["bash", str(script)], env=environment)
+        return subprocess.Popen(["bash", str(script)], env=environment, cwd=tools)  # wherever the node begins
 
     return start
 
@@ -112,12 +112,15 @@ def test_a_path_that_a_line_cannot_hold_is_refused(small, tmp_path):
 def test_an_index_trains_its_run_with_the_cores_that_it_has(small, tmp_path, stand_in, submit, monkeypatch):
     from torchrl_etdmpc.suites import slurm
 
-    told = "import os, sys, pathlib; pathlib.Path(sys.argv[1]).write_text(os.environ['OMP_NUM_THREADS'] + sys.argv[2])"
+    told = (
+        "import os, sys, pathlib; words = os.environ['OMP_NUM_THREADS'], sys.argv[2], os.getcwd(); "
+        "pathlib.Path(sys.argv[1]).write_text(' '.join(words))"
+    )
     monkeypatch.setattr(slurm, "command", lambda run: [sys.executable, "-S", "-c", told, str(run.path / "told")])
     runs = small.experiment(settings=small.settings | {"threads": None}, seeds=(1, 2)).runs(tmp_path)
     script = write_slurm_script(runs, tmp_path, "mine")
     assert submit(script, 1).wait() == 0
-    assert (runs[1].path / "told").read_text() == "3threads=3"
+    assert (runs[1].path / "told").read_text() == f"3 threads=3 {Path.cwd()}"  # paths of one's own are from here
     assert not runs[0].path.exists()
 
 
@@ -155,6 +158,12 @@ def test_a_run_that_fails_is_tried_again_as_long_as_it_gets_further(stand_in_scr
     runs, script = stand_in_script({"": [("fail", 100), ("fail", 200), ("fail", 300), ("finish", 400)]}, retries=0)
     assert submit(script, 0).wait() == 0
     assert small.tries(runs[0]) == 4
+
+
+def test_a_run_that_fails_at_the_same_step_again_and_again_is_given_up(stand_in_script, submit, small):
+    runs, script = stand_in_script({"": [("fail", 100)] * 5 + [("finish", 400)]}, retries=1)
+    assert submit(script, 0).wait() == 1
+    assert small.tries(runs[0]) == 3  # the first one got further than nothing
 
 
 @contextlib.contextmanager
