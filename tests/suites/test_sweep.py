@@ -63,6 +63,7 @@ def test_a_trial_is_a_variant_on_every_task_and_seed_with_proposed_settings(sear
     assert config[2] == 0.4
     assert kept == {"tuned trial 0": {"loss.rho": 0.4, "optim.lr": config[0], "model.mlp_dim": config[1]}}
     assert runs[0].path == tmp_path / "tuned trial 0" / "cup-catch" / "seed1"
+    assert study_of(tmp_path).trials[0].distributions["optim.lr"].log
 
 
 @pytest.mark.parametrize("name", ["what?", "a%20b", "#ü @:"])
@@ -193,6 +194,7 @@ def test_two_processes_that_share_a_search_close_each_trial_once(search, small, 
     (done,), (bad,) = first.propose(), first.propose()
     second = Sweep(search(trials=2), "tuned", tmp_path)
     assert second.runs() == [done, bad]
+    assert not first.done and not second.done
     small.write_finished(done)
     first._tell(1, None)
     assert first.look() == []
