@@ -213,6 +213,7 @@ def test_candidates_that_diverge_leave_the_others_where_they_are():
     there = np.isfinite(trace["points"]).all((2, 3, 4))
     assert there.any() and not there.all()
     assert np.array_equal(there, np.isfinite(trace["scores"]))
+    assert np.take_along_axis(there, trace["elites"], 1).all()
     assert np.isfinite(trace["basis"]).all() and np.isfinite(trace["centre"]).all()
     assert trace["explained"].sum() == pytest.approx(1, abs=1e-5)  # of a line, by two components
 
