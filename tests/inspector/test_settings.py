@@ -64,6 +64,7 @@ def test_an_argument_that_is_not_keyword_only_is_kept_too():
         {"extra_iterations": 3, "large_action_dim": 0},
         {"scoring_dtype": "float64", "proposal_log_std_min": -2.0, "proposal_log_std_max": 1.0},
         {"observation_key": "state", "action_key": ("agent", "action"), "plan_key": ("agent", "plan")},
+        {"is_init_key": "begins", "plan_mean_key": ("agent", "carried"), "latent_key": "state"},
     ],
 )
 def test_the_same_settings_make_the_same_planner(settings):
@@ -72,7 +73,8 @@ def test_the_same_settings_make_the_same_planner(settings):
     assert again is not planner
     assert plain_settings(again) == plain_settings(planner)
     assert (again.iterations, repr(again.score)) == (planner.iterations, repr(planner.score))
-    assert (again.in_keys, again.out_keys, again.plan_keys) == (planner.in_keys, planner.out_keys, planner.plan_keys)
+    for keys in ("in_keys", "out_keys", "plan_keys", "is_init_key", "plan_mean_key", "latent_key"):
+        assert getattr(again, keys) == getattr(planner, keys), keys
     noise = planner.draw_noise(1, generator=torch.Generator().manual_seed(0))
     plans = [each.plan(torch.tensor([[0.5]]), noise=noise) for each in (planner, again)]
     assert torch.equal(plans[0].action, plans[1].action)
