@@ -249,6 +249,20 @@ def test_plans_have_the_command_s_seed(checkpoint, study):
     assert not np.allclose(change, other)
 
 
+def test_every_study_is_asked_with_the_command_s_seed(checkpoint, study, monkeypatch):
+    given = {}
+    for name in NAMES:
+
+        def ask(*_, seed: int = 0, name: str = name, **__) -> None:
+            given[name] = seed
+            raise ValueError("no more is needed")
+
+        monkeypatch.setattr(importlib.import_module(f"torchrl_etdmpc.inspector.studies.{name}"), name, ask)
+    message, _, _ = study("all", f"checkpoint={checkpoint}", *FEW)
+    assert message == "error: no more is needed"
+    assert given == dict.fromkeys(NAMES, 4)
+
+
 def test_values_are_asked_for_in_the_first_half_of_an_episode(checkpoint, study):
     message, _, _ = study("value_bias", f"checkpoint={checkpoint}", "episodes=2", "states=40", "device=cpu", "out=st")
     assert message is None
