@@ -752,6 +752,8 @@ def test_a_report_at_low_budgets_holds_every_baseline_that_was_evaluated_there_a
     assert "read off a figure" in quoted["source"]
     assert ("DR.Q", "20000", "walker-walk") not in rows
     assert not {"BMPC", "TD-MPC2", "SAC"} & {method for method, *_ in rows}
+    heads = Path("report", "final.md").read_text().splitlines()[0].split(" | ")
+    assert "DR.Q" in heads and "BMPC" not in heads
     assert {"20000", "50000"} == {step for _, step, _ in rows}  # 100,000 is beyond the budget
     page = Path("report", "index.md").read_text()
     assert re.search(r"^- FoG: .*the unit of its steps is unverified$", page, re.M)
