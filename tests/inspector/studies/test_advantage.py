@@ -48,6 +48,23 @@ def test_nothing_is_gained_over_an_optimal_policy(measure):
     assert (result.difference > -0.1).all()
 
 
+def test_every_plan_begins_from_the_one_before(measure, monkeypatch):
+    given, plans = [], []
+
+    def replan(planner, observation, carried, **options):
+        given.append(carried)
+        plans.append(replan_state(planner, observation, carried, **options))
+        return plans[-1]
+
+    replan_state = advantage.replan
+    monkeypatch.setattr(advantage, "replan", replan)
+    _, states = measure(LineWorld(), 3)
+    for index in range(5):
+        first, *following = given[3 * index : 3 * index + 3]
+        assert torch.equal(first, states.plan_mean[index : index + 1])
+        assert all(map(torch.equal, following, (plan.mean for plan in plans[3 * index : 3 * index + 2])))
+
+
 def test_the_planner_acts_within_the_horizon(measure):
     with pytest.raises(ValueError, match=r"steps must be in 1..horizon=5, got 6"):
         measure(LineWorld(), 6)

@@ -66,9 +66,11 @@ def test_the_plan_before_is_compared_a_step_further_on_and_other_samples_are_oth
     states = choose_states(episodes, 9)
     result, kept = consistency.consistency(planner, states, seed=3), states.step > 0
     observation, carried = states.observation[kept], states.plan_mean[kept]
-    warm = replan(planner, observation, carried, generator=generator_of(planner, 3), trace=True)
+    generator = generator_of(planner, 3)
+    warm, again = (replan(planner, observation, carried, generator=generator, trace=True) for _ in range(2))
     moved = (warm.mean[:, :-1] - before[1:]) / warm.trace.std[:, -1, :-1]
     assert torch.allclose(result.change[:, 0, :-1], moved.abs()[..., 0])
+    assert torch.allclose(result.change[:, 2], ((warm.mean - again.mean) / warm.trace.std[:, -1]).abs()[..., 0])
     assert (result.change[:, 2] > 0).all()
 
 

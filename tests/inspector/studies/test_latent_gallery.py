@@ -48,6 +48,14 @@ def test_pessimism_keeps_the_heads_together(make_episodes, make_planner, WorldSi
     assert "beta 10 over beta 0, geometric mean: 0." in latent_gallery.lines(result)[0]
 
 
+def test_every_beta_is_planned_with_the_same_random_numbers(make_episodes, make_planner, WorldSimulator):
+    world = LineWorld(num_dynamics=2, drift=[[DRIFT], [-DRIFT]], policy_gain=0.5)
+    states = choose_states(make_episodes(world, torch.zeros_like), 4, ahead=3)
+    planner = make_planner(world, num_samples=16, num_elites=4, iterations=1)
+    result = latent_gallery.latent_gallery(planner, states, WorldSimulator(world), betas=(1.0, 1.0))
+    assert torch.equal(*result.imagined.unbind(1))
+
+
 def test_one_head_has_no_spread_to_speak_of(make_episodes, make_planner, WorldSimulator):
     world = LineWorld(num_dynamics=1, policy_gain=1.0)
     states = choose_states(make_episodes(world, world.optimal_action), 5, ahead=4)
