@@ -334,6 +334,7 @@ def test_every_quoted_number_has_its_own_source_and_no_other_number_has_one(tmp_
         ("paper", "walker-walk", 20_000, 1.0, "table 2"),
         ("paper", "walker-walk", 100_000, 2.0, "table 2"),
         ("paper", "walker-run", 100_000, 3.0, "figure 3"),
+        ("paper", "walker-walk", 30_000, 1.5, "a poster"),  # a marker, and no cell of a table
     ]
     quoted = pd.DataFrame(rows, columns=["method", "task", "env_steps", "mean", "source"])
     page = write_report(comparison(points=quoted), tmp_path)
@@ -352,4 +353,4 @@ def test_every_quoted_number_has_its_own_source_and_no_other_number_has_one(tmp_
         ("paper", "walker-run", 100_000): "figure 3",
         ("paper", MEAN, 100_000): "table 2; figure 3",
     }
-    assert "- paper: table 2\n- paper: figure 3\n" in page.read_text(encoding="utf-8")
+    assert "- paper: table 2\n- paper: figure 3\n- paper: a poster\n" in page.read_text(encoding="utf-8")

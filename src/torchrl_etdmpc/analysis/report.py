@@ -231,7 +231,7 @@ def _steps(comparison: Comparison) -> str:
         parts += [f"### At {step:,.0f} environment steps\n", step_table(returns, step, **names)]
         if absent:
             parts.append(f"Not evaluated at {step:,.0f} on any of these tasks: {', '.join(absent)}.\n")
-    sources = points[points["env_steps"].isin(steps)].drop_duplicates(["method", "source"])
+    sources = points.drop_duplicates(["method", "source"])  # those between the steps are in the figures
     if len(sources):
         parts.append("Quoted numbers, which nobody here has measured, without intervals and seeds:\n")
         parts.append("".join(f"- {row.method}: {row.source}\n" for row in sources.itertuples()))
