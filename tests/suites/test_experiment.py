@@ -396,6 +396,13 @@ def test_a_shorter_budget_is_refused(write, tmp_path):
         extended(stored, asked, tmp_path)
 
 
+def test_a_budget_that_is_shorter_on_one_of_the_tasks_is_refused(write, tmp_path):
+    tasks = ["walker-walk", "dog-run"]  # of two benchmarks
+    stored, asked = (read_experiment(write(tasks=tasks, budget=budget)) for budget in ("benchmark", 200_000))
+    with pytest.raises(ValueError, match="with total_env_steps=600000 for variant 'one', now it is 200000, which is"):
+        extended(stored, asked, tmp_path)
+
+
 def test_env_steps_among_the_settings_are_the_budget(write, tmp_path):
     experiment = read_experiment(write(budget=None, settings={"preset": "cpu", "total_env_steps": 30_000}))
     assert experiment.budget == 30_000
