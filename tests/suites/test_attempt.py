@@ -76,7 +76,10 @@ def test_settings_of_every_kind_are_parsed_back(parsed, small, tmp_path):
 def test_a_run_begins_in_a_directory_of_its_own_with_its_own_threads_and_gpu(small, tmp_path, monkeypatch):
     (run,) = small.experiment(settings=small.settings | {"threads": None}).runs(tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    told = "import os, sys; print(os.environ['OMP_NUM_THREADS'], os.environ.get('CUDA_VISIBLE_DEVICES'), sys.argv[1:])"
+    told = (
+        "import os, sys; assert os.getsid(0) == os.getpid(); "  # Ctrl-C in the terminal does not reach it
+        "print(os.environ['OMP_NUM_THREADS'], os.environ.get('CUDA_VISIBLE_DEVICES'), sys.argv[1:])"
+    )
     monkeypatch.setattr(attempt, "command", lambda run, **more: [sys.executable, "-c", told, *map(str, more.values())])
     assert start(run, threads=2, gpu="3").wait() == 0
     assert small.log_of(run) == ["suite: begun", "2 3 ['2']"]
