@@ -79,6 +79,12 @@ def test_an_interval_holds_its_value_and_none_is_beside_no_value():
     assert nothing.value.isnan() and nothing.low.isnan() and nothing.high.isnan()
 
 
+def test_an_episode_of_which_no_state_was_drawn_changes_no_interval():
+    values = torch.tensor([0.0, 1.0, 5.0, 7.0])
+    with_gaps, without = (episode_interval(values, torch.tensor(of)) for of in ([2, 2, 5, 7], [0, 0, 1, 2]))
+    assert all(map(torch.equal, with_gaps, without))
+
+
 def test_one_episode_has_no_interval():
     interval = episode_interval(torch.arange(3.0), torch.zeros(3))
     assert interval.value.item() == 1
