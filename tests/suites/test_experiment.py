@@ -182,6 +182,10 @@ def test_what_a_file_says_wrong_is_named(write, changes, message):
         ({"search": {"optim.lr": 3}}, "search of optim.lr must be a list of values or low and high"),
         ({"search": {"optim.lr": {"low": 1}}}, "search of optim.lr must be a list of values or low and high"),
         (
+            {"search": {"optim.lr": {"low": 1, "high": 1}}},
+            "search of optim.lr must be a list of values or low and high",
+        ),
+        (
             {"search": {"optim.lr": {"low": 2, "high": 1}}},
             "search of optim.lr must be a list of values or low and high",
         ),
