@@ -46,6 +46,7 @@ def test_a_trace_holds_the_planner_s_own_numbers():
         assert np.array_equal(trace[name], getattr(plan, name)[0].numpy()), name
     assert np.array_equal(trace["chosen_actions"][0], trace["action"])
     assert trace["proposals"].tolist() == [True] * 4 + [False] * 20
+    assert (trace.iterations, trace.horizon, trace.num_dynamics) == (3, 4, 3)
     best = np.sort(trace["scores"], axis=1)[:, ::-1][:, :5]
     assert np.array_equal(np.take_along_axis(trace["scores"], trace["elites"], 1), best)
     fitted = (trace["elite_weights"][0][:, None, None] * trace["actions"][0][trace["elites"][0]]).sum(0)
@@ -87,6 +88,8 @@ def test_of_the_elites_the_one_that_was_drawn_is_chosen():
 
 def test_what_does_not_come_from_the_search_is_what_the_planner_would_say():
     planner = make()
+    for weight in planner.world_model.parameters():  # those of rewards and values are zeros at first
+        torch.nn.init.normal_(weight, std=0.3)
     trace = trace_plan(planner, OBSERVATION)
     model = planner.world_model
     latent = model.encode(OBSERVATION)
@@ -132,6 +135,14 @@ def test_points_are_projections_of_each_head_s_latents():
     np.testing.assert_allclose(trace["basis"] @ trace["basis"].T, np.eye(3), atol=1e-5)
     assert np.all(np.diff(trace["explained"]) <= 1e-6)
     assert 0 < trace["explained"].sum() <= 1
+    apart = []  # of all candidates in all iterations
+    for actions in torch.from_numpy(trace["actions"]):
+        latent = model.encode(OBSERVATION).expand(3, 1, -1)
+        for step in range(4):
+            latent = model.next(latent, actions[:, step])
+            apart.append(latent.detach().numpy() - trace["centre"])
+    shown = np.square(trace["points"]).sum((0, 1, 2, 3)) / np.square(apart).sum()
+    np.testing.assert_allclose(trace["explained"], shown, rtol=1e-3)
 
 
 def test_components_find_the_plane_that_points_lie_in():
