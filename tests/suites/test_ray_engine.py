@@ -155,11 +155,12 @@ def test_a_trial_that_ends_early_is_cancelled_once_and_not_begun_again(fake, sma
 )
 def test_as_many_run_as_the_nodes_have_room_for(fake, small, tmp_path, monkeypatch, resources, options, needs, room):
     ray = fake(*resources)
-    now, most, lock = [0], [0], threading.Lock()
+    now, most, given, lock = [0], [0], set(), threading.Lock()
     all_there = threading.Event()
 
     def train(run, threads):
         with lock:
+            given.add(threads)
             now[0] += 1
             most[0] = max(most[0], now[0])
             if now[0] == room:
@@ -176,6 +177,7 @@ def test_as_many_run_as_the_nodes_have_room_for(fake, small, tmp_path, monkeypat
     assert run_on_ray(RunQueue(small.experiment(seeds=tuple(range(1, 13))).runs(tmp_path)), **options)
     assert most[0] == room
     assert (ray.asked[0]["num_cpus"], ray.asked[0]["num_gpus"]) == needs
+    assert given == {max(int(needs[0]), 1)}
 
 
 def test_a_cluster_without_room_for_a_run_is_named(fake, small, tmp_path):
@@ -210,6 +212,14 @@ def test_a_run_that_is_cancelled_is_asked_to_save_itself(small, tmp_path, monkey
     (run,) = small.experiment().runs(tmp_path)
     assert ray_engine._train(run, 1) == 75
     assert told == [1]
+
+
+def test_a_suite_that_stops_asks_every_run_once_and_waits_for_all(small, tmp_path):
+    runs = small.experiment(seeds=(1, 2)).runs(tmp_path)
+    told, awaited, said = [], [], []
+    ray = SimpleNamespace(cancel=told.append, wait=lambda references, num_returns: awaited.append(num_returns))
+    ray_engine._stop(ray, dict(zip("ab", runs, strict=True)), RunQueue(runs, say=said.append), {"a"})
+    assert (told, awaited, said) == (["b"], [2], ["stopping: 2 runs save themselves"])
 
 
 def test_an_address_where_nobody_answers_is_named_at_once(small, tmp_path):
