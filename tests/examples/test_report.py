@@ -361,6 +361,11 @@ def test_an_option_that_makes_no_sense_is_refused(refused, arguments, message):
     assert refused("runs", *arguments).startswith(message)
 
 
+def test_a_run_with_the_name_of_a_quoted_method_is_refused(refused):
+    make_run("runs/a")
+    assert refused("MR.Q=runs/a") == ("MR.Q names both runs and a baseline; give the runs another name (NAME=PATH).")
+
+
 def test_the_traceback_can_be_asked_for(run_main, monkeypatch):
     monkeypatch.setenv("TORCHRL_ETDMPC_TRACEBACK", "1")
     with pytest.raises(OSError, match="nowhere"):
