@@ -154,6 +154,13 @@ def test_components_find_the_plane_that_points_lie_in():
     assert components.basis[0] @ plane[:, 0] > 0.99 or components.basis[0] @ plane[:, 0] < -0.99
 
 
+def test_the_largest_entry_of_a_component_is_positive():
+    for seed in range(5):
+        rows = torch.randn(50, 6, generator=torch.Generator().manual_seed(seed))
+        basis = principal_components(rows).basis
+        assert (basis.gather(1, basis.abs().argmax(1, keepdim=True)) > 0).all()
+
+
 def test_the_mixture_is_there_with_the_adaptive_score_only():
     planner = make(score="adaptive", beta=1.0)
     trace = trace_plan(planner, OBSERVATION)
