@@ -36,7 +36,7 @@ from matplotlib.figure import Figure
 from tensordict.nn import TensorDictModule
 
 from torchrl_etdmpc.analysis import Run, add_interval, estimate, find_runs, join_runs
-from torchrl_etdmpc.analysis.curves import read_evaluations
+from torchrl_etdmpc.analysis.runs import read_evaluations
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import get_task, make_env
 from torchrl_etdmpc.envs.dmc import domain_and_task

@@ -29,22 +29,13 @@ from torchrl_etdmpc.analysis.comparison import (
     merge_estimates,
     on_common_steps,
 )
-from torchrl_etdmpc.analysis.curves import (
-    Run,
-    find_runs,
-    join_curves,
-    join_runs,
-    mixed_settings,
-    read_curves,
-    read_points,
-    read_run,
-    read_runs,
-)
+from torchrl_etdmpc.analysis.curves import join_curves, read_curves, read_points
 from torchrl_etdmpc.analysis.experiment import Experiment, experiment_root, incomplete_runs, read_experiment
 from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run
 from torchrl_etdmpc.analysis.paired import compare_paired
 from torchrl_etdmpc.analysis.report import write_report
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
+from torchrl_etdmpc.analysis.runs import Run, find_runs, join_runs, mixed_settings, read_run, read_runs
 from torchrl_etdmpc.analysis.statistics import (
     add_interval,
     aggregate,

@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from torchrl_etdmpc.analysis.benchmarks import BENCHMARKS
-from torchrl_etdmpc.analysis.curves import Run
+from torchrl_etdmpc.analysis.runs import Run
 
 EXPERIMENT = "experiment.yaml"
 SLACK = 0.02  # finished runs of one budget differ by a step, which is of all environments side by side

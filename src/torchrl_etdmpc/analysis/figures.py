@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
-from torchrl_etdmpc.analysis.curves import read_evaluations, read_header
+from torchrl_etdmpc.analysis.runs import read_evaluations, read_header
 from torchrl_etdmpc.analysis.statistics import Z_95, add_interval, interpolate
 from torchrl_etdmpc.analysis.steps import no_points
 from torchrl_etdmpc.runs import RunDirectory
