@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import os
@@ -20,7 +19,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("pandas")
 pytest.importorskip("scipy")
 
-from torchrl_etdmpc.commands import report  # noqa: E402
+from torchrl_etdmpc.commands import report_runs  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "report.py"
@@ -183,12 +182,12 @@ def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_inter
 @pytest.mark.parametrize("name", ["config.yaml", "eval.csv", "summary.json", "experiment.yaml"])
 def test_watching_notices_what_a_report_reads(name):
     root = make_experiment()
-    arguments = argparse.Namespace(runs=[str(root)])
-    before = report.stamp(arguments)
-    assert report.stamp(arguments) == before
+    runs = [str(root)]
+    before = report_runs.stamp(runs)
+    assert report_runs.stamp(runs) == before
     file = next(path for path in (root / name, root / "a" / "walker-walk" / "seed1" / name) if path.exists())
     file.write_text(file.read_text() + "\n")
-    assert report.stamp(arguments) != before
+    assert report_runs.stamp(runs) != before
 
 
 def test_names_make_methods_of_folders_and_options_are_obeyed(run_main, capfd):
@@ -598,7 +597,7 @@ def test_the_home_directory_may_be_short(monkeypatch, tmp_path, run_main, capfd)
     make_run("my runs/a")
     run_main("~/my runs", "--out", "~/a report", "--reference")
     assert (tmp_path / "a report" / "index.md").is_file()
-    assert report.named("mine=~/my runs") == ("mine", f"{tmp_path}/my runs")
+    assert report_runs.named("mine=~/my runs") == ("mine", f"{tmp_path}/my runs")
 
 
 def make_experiment(root: str = "runs/exp", *, seeds: tuple[int, ...] = (1, 2)) -> Path:
@@ -720,8 +719,8 @@ def test_a_run_that_ends_a_step_before_the_budget_of_the_comparison_is_named(run
 
 
 def test_of_many_missing_runs_the_line_names_five():
-    assert report.missing(list("abcde")) == "; 5 missing or unfinished (a; b; c; d; e)"
-    assert report.missing(list("abcdefg")) == "; 7 missing or unfinished (a; b; c; d; e; and 2 more)"
+    assert report_runs.missing(list("abcde")) == "; 5 missing or unfinished (a; b; c; d; e)"
+    assert report_runs.missing(list("abcdefg")) == "; 7 missing or unfinished (a; b; c; d; e; and 2 more)"
 
 
 def test_a_plan_that_no_run_has_reached_yet_is_compared_where_all_are(run_main, capfd):
