@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pandas as pd
+from typing import Any
 
 from torchrl_etdmpc.analysis import (
     BENCHMARKS,
@@ -14,11 +14,12 @@ from torchrl_etdmpc.analysis import (
     own_benchmark,
 )
 
+Table = Any  # of pandas, whose types know no column
 DEFAULT_GRID_STEP = 100_000
 MOST_POINTS = 1000  # of a grid: more take minutes, and evaluations are not that dense
 
 
-def choose_benchmark(name: str | None, runs: pd.DataFrame) -> Benchmark:
+def choose_benchmark(name: str | None, runs: Table) -> Benchmark:
     """The one asked for, or that of the runs' tasks; tasks of no benchmark, e.g. Gymnasium's, are one of their own."""
     present = list(dict.fromkeys(runs["task"]))
     own = [task for task in present if not any(task in benchmark.tasks for benchmark in BENCHMARKS.values())]
@@ -32,7 +33,7 @@ def choose_benchmark(name: str | None, runs: pd.DataFrame) -> Benchmark:
 
 
 def choose_budget(
-    asked: int | None, asked_step: int | None, benchmark: Benchmark, runs: pd.DataFrame, experiments: list[Experiment]
+    asked: int | None, asked_step: int | None, benchmark: Benchmark, runs: Table, experiments: list[Experiment]
 ) -> tuple[int, int]:
     """The budget and the step of the AUC's grid: what was asked for or planned, the benchmark's, or what all reach."""
     least, most = reached(runs), ends(runs).max()
@@ -74,7 +75,7 @@ def choose_budget(
 
 
 def choose_base(
-    name: str | None, runs: pd.DataFrame, methods: list[str], experiments: list[Experiment]
+    name: str | None, runs: Table, methods: list[str], experiments: list[Experiment]
 ) -> tuple[str, list[str]]:
     """The base and the variants that are compared with it, if there are any.
 
@@ -93,11 +94,11 @@ def choose_base(
     return base, variants
 
 
-def ends(runs: pd.DataFrame) -> pd.DataFrame:
+def ends(runs: Table) -> Table:
     """Env steps of each run's last return that is a number."""
     return runs.dropna(subset="return_mean").groupby(["method", "task", "seed"])["env_steps"].max()
 
 
-def reached(runs: pd.DataFrame) -> int:
+def reached(runs: Table) -> int:
     """Env steps that all runs reach."""
     return int(ends(runs).min())

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -35,7 +36,8 @@ from torchrl_etdmpc.commands.report_choices import choose_base, choose_benchmark
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.runs.files import make_folder
 
-Baselines = Sequence[tuple[Path | str, pd.DataFrame]]  # files and what they hold
+Table = Any  # of pandas, whose types know no column
+Baselines = Sequence[tuple[Path | str, Table]]  # files and what they hold
 
 _REFERENCE = Path(__file__).resolve().parents[1] / "analysis" / "reference"
 DEFAULT_REFERENCES = tuple(_REFERENCE / f"{name}.csv" for name in ("bmpc", "tdmpc2", "lowbudget"))
@@ -79,9 +81,9 @@ def report(arguments: argparse.Namespace, references: Baselines, points: Baselin
     # Published returns are of whole episodes.
     shorter = {run.task for run in found if any(setting.startswith("episode_length") for setting in run.changed)}
     shorter &= set(tasks)
-    beside = [table[table["task"].isin(set(benchmark.tasks) - shorter)] for _, table in references]
+    beside: list[Table] = [table[table["task"].isin(set(benchmark.tasks) - shorter)] for _, table in references]
     means = [table for table in beside if "return_mean" not in table]
-    quoted = pd.concat([table for _, table in points] or [no_points()], ignore_index=True)
+    quoted: Table = pd.concat([table for _, table in points] or [no_points()], ignore_index=True)
     quoted = quoted[~quoted["task"].isin(shorter)]
     refuse_clash(methods, [*beside, quoted])
     curves = join_curves([runs, *(table for table in beside if "return_mean" in table)])
@@ -198,7 +200,7 @@ def stamp(arguments: Iterable[str]) -> list[tuple[str, int, int]]:
     return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 
 
-def with_evaluations(runs: pd.DataFrame) -> pd.DataFrame:
+def with_evaluations(runs: Table) -> Table:
     """The runs with a return after 0 env steps: one that has just begun would make nothing of the comparison.
 
     Raises:
@@ -211,7 +213,7 @@ def with_evaluations(runs: pd.DataFrame) -> pd.DataFrame:
     return runs
 
 
-def refuse_clash(methods: list[str], tables: list[pd.DataFrame]) -> None:
+def refuse_clash(methods: list[str], tables: list[Table]) -> None:
     """Raises ValueError if runs have the name of a baseline, or of a column that every table has."""
     for name in RANKS:
         if name in methods:
@@ -221,7 +223,7 @@ def refuse_clash(methods: list[str], tables: list[pd.DataFrame]) -> None:
         raise ValueError(f"{clash[0]} names both runs and a baseline; give the runs another name (NAME=PATH).")
 
 
-def tasks_of_no_use(file: Path | str, table: pd.DataFrame, benchmark: Benchmark, kind: str) -> list[str]:
+def tasks_of_no_use(file: Path | str, table: Table, benchmark: Benchmark, kind: str) -> list[str]:
     """A line on a file's tasks that are in no benchmark and not among those compared, or on a file without any."""
     tasks = list(dict.fromkeys(table["task"]))
     if not set(tasks) & set(benchmark.tasks):
@@ -251,7 +253,7 @@ def changed_tasks(runs: list[Run]) -> dict[str, str]:
     return changed
 
 
-def counts(benchmark: Benchmark, tasks: Sequence[str], runs: pd.DataFrame) -> str:
+def counts(benchmark: Benchmark, tasks: Sequence[str], runs: Table) -> str:
     """What the line for the terminal says of the runs."""
     count = runs[["method", "task", "seed"]].drop_duplicates().shape[0]
     whose = benchmark.title if benchmark.name in BENCHMARKS else "no benchmark"
@@ -259,7 +261,7 @@ def counts(benchmark: Benchmark, tasks: Sequence[str], runs: pd.DataFrame) -> st
     return f"{of}, up to {runs['env_steps'].max():,.0f} env steps"
 
 
-def where_compared(benchmark: Benchmark, budget: int, runs: pd.DataFrame) -> str:
+def where_compared(benchmark: Benchmark, budget: int, runs: Table) -> str:
     """What it says of a budget that nobody asked for and that is neither the benchmark's nor where the runs end."""
     if budget == benchmark.budget and budget >= runs["env_steps"].max():
         return ""
