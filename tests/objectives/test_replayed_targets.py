@@ -122,6 +122,16 @@ def test_values_of_equally_frequent_targets_settle_at_their_expectile(expectile)
     torch.testing.assert_close(value, torch.full((2,), math.expm1(expectile * math.log(101))), rtol=1e-4, atol=0)
 
 
+def test_an_expectile_of_a_float64_model_is_weighed_in_float64():
+    world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=32, num_dynamics=1).double()
+    rollout = LatentRollout(torch.zeros(2, 4, 16), torch.rand(2, 1, 4, 16, dtype=torch.float64))
+    above = torch.full((1, 4), 5.0, dtype=torch.float64)  # new values are 0
+    for target, weight in ((above, 2 * 0.7), (-above, 2 * (1 - 0.7))):
+        error = value_error(world_model, rollout, target, dropout=False)
+        weighed = value_error(world_model, rollout, target, dropout=False, expectile=0.7)
+        torch.testing.assert_close(weighed, weight * error, rtol=1e-14, atol=0)
+
+
 def test_a_term_that_reads_ends_does_not_end_what_is_replayed(make_loss, make_slices, run_seeded):
     term = Term("ends", lambda world_model, slices, rollout: slices.terminated.float(), keys=("terminated",))
     slices, found = make_slices(), []

@@ -135,7 +135,7 @@ def value_error(
     error = two_hot_cross_entropy(logits, target, world_model.bins)
     if expectile != 0.5:
         above = target > two_hot_decode(logits.detach().to(world_model.bins.dtype), world_model.bins)
-        error = error * torch.where(above, 2 * expectile, 2 * (1 - expectile))
+        error = torch.where(above, 2 * expectile * error, 2 * (1 - expectile) * error)  # in the dtype of the error
     return mean_of_head_rows(error.mean(0), heads)
 
 
