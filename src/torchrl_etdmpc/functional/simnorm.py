@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def simnorm(x: Tensor, group_size: int = 8) -> Tensor:
-    """Softmax (temperature 1) over groups of channels (TD-MPC2, arXiv:2310.16828, Eq. 4).
+    """Softmax (temperature 1) over groups of channels (SimNorm of TD-MPC2, arXiv:2310.16828).
 
     Group g holds the channels ``g, g + G, g + 2 G, ...`` with ``G = L / group_size``: the softmax then runs over a
     strided dimension, which is tens of times faster on a CPU than one over a last dimension of 8.

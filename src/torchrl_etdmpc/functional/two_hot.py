@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def symlog(x: Tensor) -> Tensor:
-    """Symmetric logarithm ``sign(x) ln(1 + |x|)`` (DreamerV3, Eq. 9), elementwise over any shape.
+    """Symmetric logarithm ``sign(x) ln(1 + |x|)`` (DreamerV3), elementwise over any shape.
 
     >>> symlog(torch.tensor([0.0, -1.0])).tolist()
     [0.0, -0.6931471824645996]
@@ -81,7 +81,7 @@ def two_hot_decode(logits: Tensor, bins: Tensor) -> Tensor:
 
 
 def two_hot_cross_entropy(logits: Tensor, target: Tensor, bins: Tensor) -> Tensor:
-    """Cross-entropy between the two-hot target and the log-softmax of the logits (thesis 2.3; DreamerV3, Eq. 10).
+    """Cross-entropy between the two-hot target and the log-softmax of the logits (DreamerV3).
 
     Args:
         logits (Tensor): unnormalised log-probabilities, shape ``[..., M]``.
