@@ -57,7 +57,8 @@ def _format_warning(message: Any, category: Any, filename: str, lineno: int, lin
 def _write(line: str, stream: TextIO) -> None:
     if stream.isatty():  # which would break words
         width = max(shutil.get_terminal_size().columns - 9, 20)
-        line = "\n         ".join(textwrap.wrap(line, width, break_long_words=False))
+        # Paths stay whole, which have hyphens.
+        line = "\n         ".join(textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False))
     try:
         from tqdm import tqdm
     except ImportError:
