@@ -81,15 +81,39 @@ def test_a_phase_that_passes_has_its_lines_in_the_log_too(monkeypatch, capsys):
     assert line[8:].startswith(" evaluation: 2 of 500 decisions, ")
 
 
-def test_a_phase_that_goes_on_counts_from_where_it_was_and_so_does_its_time_left(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("done", "total", "left"),
+    [
+        (998, 1000, "2 min"),  # nothing is done yet
+        (1000, 1001, "30 s"),
+        (999, 1000, "1 min"),
+        (999, 1058, "59 min"),
+        (999, 1059, "1.0 h"),
+        (999, 1149, "2.5 h"),
+    ],
+)
+def test_a_phase_that_goes_on_counts_from_where_it_was_and_so_does_its_time_left(
+    monkeypatch, capsys, done, total, left
+):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    with console(), progress_bar("learning", 1000, "env steps", initial=998) as bar:
+    with console(), progress_bar("learning", total, "env steps", initial=998) as bar:
         now[0] = 60.0
-        bar.advance()
+        bar.advance() if done == 999 else bar.update(done)
     (line,) = capsys.readouterr().out.splitlines()
-    assert line[8:] == " learning: 999 of 1000 env steps, 1 min left"
+    assert line[8:] == f" learning: {done} of {total} env steps, {left} left"
+
+
+def test_a_note_stays_in_the_lines_until_there_is_another(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with console(), progress_bar("learning", 1000, "env steps") as bar:
+        for now[0], note in ((60.0, "return 31.2"), (120.0, None), (180.0, "return 40.0")):
+            bar.update(500, note)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.rpartition(", ")[2] for line in lines] == ["return 31.2", "return 31.2", "return 40.0"]
 
 
 def test_where_steps_differ_in_length_nothing_says_how_long_the_rest_takes(monkeypatch, capsys):
