@@ -104,7 +104,8 @@ def test_what_a_kill_left_of_a_file_goes_and_other_people_s_files_stay(tmp_path,
         directory.begin(CONFIG)
         directory.close()
     directory.path.mkdir(exist_ok=True)
-    ours = [directory.path / f".{name}" for name in ("curve.0badcafe.partial.png", "config.0badcafe.partial.yaml")]
+    names = ("config.yaml", "train.csv", "eval.csv", "curve.png", "summary.json", "wandb_id")
+    ours = [directory.path / f".{Path(name).stem}.0badcafe.partial{Path(name).suffix}" for name in names]
     film = directory.path / ".film.0badcafe.partial.mp4"
     for file in (*ours, film):
         file.touch()
@@ -229,6 +230,14 @@ def test_another_process_is_kept_out_until_the_run_is_closed(begun, elsewhere):
     assert elsewhere(go_on) == busy
 
 
+def test_who_holds_a_run_may_ask_whether_it_is_in_use_and_keeps_it(begun, elsewhere):
+    assert begun.in_use
+    busy = elsewhere(lambda: RunDirectory(begun.path).go_on())
+    assert busy is not None and "is in use by another process" in busy
+    begun.close()
+    assert not begun.in_use
+
+
 def test_of_two_processes_that_begin_at_once_only_one_does(begun, elsewhere):
     """The other one looked before the configuration was there."""
     begun.config.unlink()
@@ -349,6 +358,7 @@ def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch):
     directory = RunDirectory(tmp_path / "run")
     directory.begin(CONFIG)
     assert directory.read_config() == CONFIG
+    assert not directory.in_use
 
 
 ROW = "env_steps,decision_steps,updates,wall_time_s,return_mean\n{},0,0,1.0,3.5\n"
@@ -412,11 +422,14 @@ def test_a_new_run_is_another_one_for_wandb_than_the_leftover_before_it(begun):
         {"train_csv": ROW.format(1)},
         {"eval_csv": "my,own,table\n1,2,3\n"},
         {"eval_csv": "env_steps\nmany\n"},
+        {"eval_csv": "a,env_steps\n1\n"},
+        {"eval_csv": "a,env_steps\n" + "1" * 200_000 + ",0\n"},  # more than Python's reader takes
         {"summary_json": "{}"},
         {"checkpoints__resume__000000000050__manifest_json": "{}"},
         {"checkpoints__resume__.000000000050.old__manifest_json": "{}"},
         {"config_yaml": "my: own"},
         {"config_yaml": "- a list"},
+        {"config_yaml": "3"},
         {"config_yaml": "\x00"},
     ],
 )
@@ -498,6 +511,12 @@ def test_a_configuration_that_changed_is_stored_and_another_left_alone(begun):
     assert (begun.config.stat().st_ino, begun.config.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
     begun.write_config(CONFIG | {"seed": 2})
     assert begun.read_config() == CONFIG | {"seed": 2}
+
+
+def test_a_configuration_that_somebody_changed_is_refused(begun):
+    begun.config.write_text(begun.config.read_text().replace("seed: 1", "seed: 2"))
+    with pytest.raises(ValueError, match=r"yaml is not a configuration: it is not what the run wrote; settings are ch"):
+        begun.read_config()
 
 
 def test_there_must_be_a_run_to_go_on_with(tmp_path):
