@@ -5,6 +5,7 @@ import hashlib
 import os
 import pickle
 import stat
+import sys
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
@@ -18,6 +19,8 @@ from torchrl_etdmpc.runs.files import (
     file_lock,
     link,
     load_tensors,
+    make_folder,
+    pack_tensors,
     read_tensors,
     read_whole,
     remove_partial_files,
@@ -177,6 +180,39 @@ def test_processes_change_a_file_one_after_the_other(tmp_path, in_copy):
     assert file.read_text() == "100"
 
 
+@pytest.mark.parametrize("system", ["without locks of files", "without locks"])
+def test_where_there_are_no_locks_nobody_waits(tmp_path, monkeypatch, system):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    if system == "without locks":
+        monkeypatch.setitem(sys.modules, "fcntl", None)
+    else:
+        monkeypatch.setattr(pytest.importorskip("fcntl"), "lockf", no_locks)
+    entered = []
+    with file_lock(tmp_path / ".lock"):
+        entered.append(True)
+    assert entered == [True]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts the files that are open")
+def test_no_file_stays_open(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    before = os.listdir("/proc/self/fd")
+    write_whole(tmp_path / "file", NEW)
+    assert read_whole(tmp_path / "file") == NEW
+    for path in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(DamagedFileError, match="is not a regular file"):
+            read_whole(path)
+    assert len(os.listdir("/proc/self/fd")) == len(before)
+
+
+def test_a_folder_in_the_place_of_which_a_file_lies_is_refused(tmp_path):
+    (tmp_path / "notes").write_bytes(OLD)
+    with pytest.raises(ValueError, match=r"notes is a file; name a folder\.$"):
+        make_folder(tmp_path / "notes")
+
+
 def test_tensors_come_back_and_the_checksum_is_the_file_s(tmp_path):
     content = {"x": torch.randn(3, 4), "n": 3, "list": [torch.arange(2), "text", None], "nested": {"y": 1.5}}
     stamp, data = write_tensors(tmp_path / "a.pt", content), (tmp_path / "a.pt").read_bytes()
@@ -235,6 +271,14 @@ def test_a_file_that_unpacks_to_more_than_it_has_is_not_unpacked(tmp_path):
         DamagedFileError, match=r"a\.pt is compressed, which no file of torch\.save is; it was not loaded"
     ):
         load_tensors(data, path)
+
+
+def test_a_damaged_tensor_in_a_file_without_a_stamp_is_found_by_its_own_checksum(tmp_path):
+    content = torch.arange(1000)
+    data = bytearray(pack_tensors({"x": content}))
+    data[data.index(content.numpy().tobytes()) + 80] ^= 1
+    with pytest.raises(DamagedFileError, match=r"a\.pt is damaged: the checksum of .*data/0 in it is wrong\.$"):
+        load_tensors(bytes(data), tmp_path / "a.pt")
 
 
 def test_what_is_not_a_file_or_too_large_is_refused_before_it_is_read(tmp_path):
