@@ -69,9 +69,10 @@ def test_a_metric_must_not_take_a_counters_name(tmp_path, log):
     assert not (tmp_path / "train.csv").exists()
 
 
-def test_a_metric_must_be_one_number(tmp_path, log):
-    with pytest.raises(TypeError, match=r"^loss must be a number or a one-element tensor, got Tensor; reduce it"):
-        log.log_train({"loss": torch.zeros(2)}, **COUNTERS)
+@pytest.mark.parametrize(("value", "kind"), [(torch.zeros(2), "Tensor"), ("high", "str"), (None, "NoneType")])
+def test_a_metric_must_be_one_number(tmp_path, log, value, kind):
+    with pytest.raises(TypeError, match=rf"^loss must be a number or a one-element tensor, got {kind}; reduce it"):
+        log.log_train({"loss": value}, **COUNTERS)
     assert not (tmp_path / "train.csv").exists()
 
 
@@ -141,7 +142,7 @@ def test_a_logger_on_a_full_disk_costs_its_own_rows_alone(tmp_path, log):
 def test_finish_writes_valid_json_with_null_for_what_is_not_finite(tmp_path, log):
     log.log_eval(RESULTS, **COUNTERS)
     summary = {"task": "walker-walk", "final_return": math.nan, "best_return": torch.tensor(31.0), "device": Path("x")}
-    path = log.finish({**summary, "nested": [math.inf, {"a": -math.inf, "done": True}]})
+    path = log.finish({**summary, "nested": [math.inf, {"a": -math.inf, "done": True}, (1, 2)]})
 
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
@@ -155,7 +156,7 @@ def test_finish_writes_valid_json_with_null_for_what_is_not_finite(tmp_path, log
         "final_return": None,
         "best_return": 31.0,
         "device": "x",
-        "nested": [None, {"a": None, "done": True}],
+        "nested": [None, {"a": None, "done": True}, [1, 2]],
     }
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "config.yaml", "eval.csv", "summary.json"]
 
