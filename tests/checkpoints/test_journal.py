@@ -138,6 +138,22 @@ def test_targets_may_lack_what_no_part_reads(tmp_path, name):
     assert_same(buffer, copy)
 
 
+def test_targets_of_two_bytes_or_one_are_saved_as_well(tmp_path):
+    run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
+    run.write(10)
+    rows = run.buffer.storage[:].clone()
+    rows["plan", "loc"] = torch.randn(10, 3).bfloat16()
+    rows["plan", "version"] = rows["plan", "version"].to(torch.int8)
+    buffer = make_buffer()
+    buffer.extend(rows)
+    journal.save(buffer)
+    buffer.storage[:]["plan", "loc"][3] = 7.0
+    buffer.storage[:]["plan", "version"][4] += 1
+    copy = make_buffer()
+    ReplayJournal(tmp_path).load(copy, journal.save(buffer))
+    assert_same(buffer, copy)
+
+
 @pytest.mark.parametrize("again", [False, True])
 def test_what_has_not_changed_is_not_written_again(tmp_path, again):
     run, journal = Pipeline(make_buffer(12)), ReplayJournal(tmp_path)
@@ -186,7 +202,7 @@ def test_older_states_stay_loadable_until_they_are_pruned(tmp_path):
         ReplayJournal(tmp_path).load(make_buffer(30), states[0][0])
 
 
-@pytest.mark.parametrize("count", [0, 1, 9, 10, 11, 25, 60])
+@pytest.mark.parametrize("count", [0, 1, 9, 10, 11, 25, 59, 60])
 def test_a_buffer_that_was_emptied_is_saved_as_it_is_now(tmp_path, count):
     run, journal = Pipeline(make_buffer()), ReplayJournal(tmp_path)
     run.write(10)
@@ -312,12 +328,17 @@ def test_a_large_buffer_is_split_into_files(tmp_path, monkeypatch):
         (48, 64),
         (64, 70),
     ]
+    run.refresh(70)  # of the rows of every file
+    files = journal.save(run.buffer)
     copy = make_buffer(100)
     ReplayJournal(tmp_path).load(copy, files)
     assert_same(run.buffer, copy)
 
 
-@pytest.mark.parametrize(("written", "capacity", "fits"), [(8, 30, True), (8, 7, False), (12, 30, False)])
+@pytest.mark.parametrize(
+    ("written", "capacity", "fits"),
+    [(8, 30, True), (8, 8, True), (10, 30, True), (8, 7, False), (12, 30, False)],
+)
 def test_a_buffer_that_was_not_full_fits_into_a_larger_one(tmp_path, written, capacity, fits):
     run = Pipeline(make_buffer(10))
     run.write(written)
@@ -370,6 +391,18 @@ def test_a_damaged_file_is_named(tmp_path, part, how):
     damage(file, how)
     with pytest.raises(DamagedFileError, match=file.name):
         ReplayJournal(tmp_path).load(make_buffer(), files)
+
+
+def test_of_a_file_whose_first_rows_were_overwritten_the_others_are_salvaged(tmp_path):
+    run, journal = Pipeline(make_buffer(20)), ReplayJournal(tmp_path)
+    for count in (15, 10):
+        run.write(count)
+        files = journal.save(run.buffer)
+    copy = make_buffer(20)
+    assert ReplayJournal(tmp_path).salvage(copy, files) == []
+    wanted = run.buffer[:][torch.arange(5, 25) % 20]
+    for key in ("number", "observation", ("plan", "loc"), ("plan", "version")):
+        assert torch.equal(copy[:][key], wanted[key])
 
 
 @pytest.mark.parametrize("lost", ["base", "change"])
