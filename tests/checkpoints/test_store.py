@@ -574,6 +574,35 @@ def test_a_part_that_does_not_fit_is_named(store):
         store.load({"layer": nn.Linear(3, 3)}, other.buffer)
 
 
+@pytest.mark.parametrize("error", [RuntimeError, ValueError, KeyError, TypeError, AttributeError])
+def test_whatever_a_part_makes_of_a_state_of_another_kind_is_one_line(store, error):
+    work = Work().do()
+    save(store, 1, work)
+
+    class Other(Counter):
+        def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+            raise error("another kind")
+
+    with pytest.raises(CheckpointError, match=r"/000000000001/counter\.pt does not fit this run: .*another kind'?$"):
+        store.load({"counter": Other()}, work.buffer)
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "{}", '{"format": 4}', "[" * 100_000, "not JSON", ""])
+def test_a_manifest_that_is_none_is_passed_over_for_the_one_before(store, content):
+    work = Work()
+    first = save(store, 100, work.do())
+    save(store, 200, work.do())
+    (store.folder / "resume" / f"{200:012d}" / "manifest.json").write_text(content)
+    with pytest.warns(UserWarning, match=rf"/{200:012d}/manifest.json is missing or damaged\.$"):
+        assert load(store.folder) == (f"{100:012d}", first)
+
+
+def test_a_folder_that_is_no_checkpoint_is_of_no_step(store):
+    save(store, 100, Work().do())
+    (store.folder / "resume" / "2 notes").mkdir()
+    assert store.newest_step() == 100
+
+
 def test_single_rows_are_read_from_the_file_that_holds_them(tmp_path, monkeypatch):
     work, store = Work(), CheckpointStore(tmp_path)
     assert store.buffer_rows() == 0
@@ -586,10 +615,10 @@ def test_single_rows_are_read_from_the_file_that_holds_them(tmp_path, monkeypatc
     opened = []
     read = store.journal._read
     monkeypatch.setattr(store.journal, "_read", lambda entry: opened.append(entry["file"]) or read(entry))
-    for row in (0, 13, 29):
+    for row in (0, 5, 13, 29):  # 5: the first of a file
         position = (15 + row) % 30
         assert torch.equal(store.read_row(row)["x"], stored[position])
-    assert len(opened) == 3
+    assert len(opened) == 4
     with pytest.raises(IndexError, match=r"row must be in \[0, 30\), the rows of the saved buffer, got 30"):
         store.read_row(30)
     for file in (tmp_path / "replay").glob("rows-*"):
