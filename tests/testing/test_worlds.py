@@ -144,6 +144,13 @@ def test_the_value_of_the_regulator_is_that_of_an_independent_solver():
     torch.testing.assert_close(world.value_matrix, torch.from_numpy(solution))
 
 
+def test_the_control_of_the_regulator_stays_within_its_bounds():
+    world = LQRWorld()
+    states = torch.tensor([[9.0, 9.0], [-9.0, -9.0]])
+    assert world.optimal_action(states).tolist() == [[-1.0], [1.0]]
+    assert world.optimal_actions(states[0], 3).abs().max() <= 1
+
+
 def test_the_value_of_the_regulator_is_the_return_of_its_own_control():
     world = LQRWorld()
     state = torch.tensor([0.2, -0.1])
@@ -236,6 +243,7 @@ def test_the_policy_obeys_other_bounds_of_its_log_std():
         ({"value_offset": [1.0, 2.0]}, r"value_offset must have one row per head, shape \(1,\), got \(2,\)\."),
         ({"step_size": 0.0}, r"step_size must be positive, got 0\.0\."),
         ({"num_dynamics": 2, "trap_head": 2}, r"trap_head must be in 0\.\.1, got 2\."),
+        ({"num_dynamics": 2, "trap_head": -1}, r"trap_head must be in 0\.\.1, got -1\."),
     ],
 )
 def test_an_impossible_world_is_refused(options, message):
