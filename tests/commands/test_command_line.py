@@ -10,7 +10,8 @@ pytest.importorskip("hydra")
 
 from torchrl_etdmpc.commands.command_line import as_typed, hydra_main  # noqa: E402
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig  # noqa: E402
-from torchrl_etdmpc.training import TrainConfig  # noqa: E402
+from torchrl_etdmpc.runs.dotted import flat  # noqa: E402
+from torchrl_etdmpc.training import PRESETS, TrainConfig  # noqa: E402
 
 
 @pytest.fixture
@@ -85,6 +86,7 @@ WRONG = [
         ("--multirun", "preset=cpu", "seed=1,-1"),
         "seed must be in [0, 2**32 - 1], got -1.",
     ),
+    (("--multirun", "preset=cpu,cpuu"), f"unknown preset 'cpuu'; choose one of {', '.join(PRESETS)}."),
     (("--help", "planer"), "there is no group and no setting 'planer'; did you mean planner? --help lists all."),
 ]
 
@@ -131,6 +133,36 @@ def test_settings_of_the_task_are_swept_and_name_directories_as_they_are_typed(
     task = ("task=gym/Pendulum-v1", "preset=cpu", f"task.episode_length={values}")
     config = run_command("--multirun", *task, "run_dir=runs/${task.episode_length}")
     assert (config.episode_length, config.run_dir) == (20, "runs/20")
+
+
+SWEPT_CODE = """
+from torchrl_etdmpc.envs import get_task
+
+def lowest(returns):
+    return returns.amin((-2, -1)).mean(-1)
+
+def highest(returns):
+    return returns.amax((-2, -1)).mean(-1)
+
+slow, fast = get_task("walker-walk"), get_task("walker-run")
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("preset", ["cpu", "tdmpc2-cpu"]),
+        ("planner.score", ["swept_code:lowest", "swept_code:highest"]),
+        ("task", ["swept_code:slow", "swept_code:fast"]),
+    ],
+)
+def test_presets_and_code_of_one_s_own_are_swept(run_command, tmp_path, monkeypatch, name, values):
+    (tmp_path / "swept_code.py").write_text(SWEPT_CODE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "swept_code", raising=False)
+    config = run_command("--multirun", f"{name}={','.join(values)}", f"run_dir=runs/${{{name}}}")
+    assert (flat(config.to_dict())[name], config.run_dir) == (values[0], f"runs/{values[0]}")
 
 
 def test_a_sweep_leaves_no_folder_but_those_of_its_runs(run_command, tmp_path, monkeypatch):
