@@ -965,6 +965,21 @@ def test_a_non_finite_observation_of_a_reset_is_named_and_not_stored(resets):
     assert collector.policy.calls == 4 * (resets - 1)
 
 
+def test_a_non_finite_observation_of_a_reset_is_named_by_a_collector_that_goes_on_from_there(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.load_simulator_state", lambda *_: True)
+    monkeypatch.setattr("torchrl_etdmpc.collectors.step.simulator_state", lambda _: {})
+    first, second = (
+        StepCollector(LineEnv(4, broken="reset", broken_at=2), RandomActions(), replay_buffer=make_replay())
+        for _ in range(2)
+    )
+    for _ in range(4):
+        first.step()
+    second.load_state_dict(first.state_dict())
+    with pytest.raises(NonFiniteError, match="the environment returned a non-finite 'observation' at decision step 4"):
+        second.step()
+    assert len(second.replay_buffer) == second.policy.calls == 0
+
+
 def test_a_non_finite_value_is_traced_to_its_environment():
     env = SerialEnv(3, [LineEnv, partial(LineEnv, broken="reward", broken_at=2), LineEnv])
     replay = make_replay()
