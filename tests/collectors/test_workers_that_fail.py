@@ -84,6 +84,46 @@ def test_new_processes_have_seeds_which_follow_from_the_random_numbers_of_the_ru
     assert seeds[0] == seeds[1] != seeds[2]
 
 
+def test_what_is_left_of_failed_processes_is_ended_before_others_start(monkeypatch):
+    happened = []
+
+    class Process:
+        def kill(self) -> None:
+            happened.append("kill")
+
+        def join(self) -> None:
+            happened.append("join")
+
+    class Closed(Process):
+        def kill(self) -> None:
+            raise ValueError("process object is closed")
+
+    class Channel:
+        def close(self) -> None:
+            happened.append("close")
+
+    class Workers:
+        is_closed, _owns_workers = False, True
+        _workers, parent_channels = (Process(), Closed(), Process()), (Channel(), Channel())
+
+        def start(self) -> None:
+            assert self.is_closed  # or TorchRL would not start anything
+            happened.append("start")
+
+        def set_seed(self, seed: int) -> None:
+            happened.append("seed")
+
+    monkeypatch.setattr("torchrl_etdmpc.envs.worker.ParallelEnv", Workers)
+    env = Workers()
+    start_workers_anew(env)
+    assert happened == ["kill", "join"] * 2 + ["close"] * 2 + ["start", "seed"]
+    happened.clear()
+    start_workers_anew(env)  # of an environment that is closed, and of one whose processes are another's
+    env.is_closed, env._owns_workers = False, False
+    start_workers_anew(env)
+    assert happened == []
+
+
 def test_what_is_no_number_names_its_environment():
     task = Task("faulty-pendulum", "mine", action_repeat=2, episode_length=1000, terminates=False)
     register_task(task, make_faulty, replace=True)

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -279,6 +280,19 @@ def test_a_worker_s_seed_is_that_of_the_generators_that_simulators_share_too():
         drawn.append((np.random.rand(), random.random(), env.reset()["observation"].tolist()))
     assert drawn[0] == drawn[1] != drawn[2]
     assert following == own(get_task("own-pendulum"), device="cpu").set_seed(4)
+    assert env.set_seed(5, static_seed=True) == 5
+
+
+@pytest.mark.parametrize("is_owner", [True, False])
+def test_a_process_that_owns_workers_is_none_also_where_another_one_started_it(monkeypatch, is_owner):
+    """TorchRL makes an environment in the owner's process, too."""
+    looked_for = []
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: SimpleNamespace(sentinel=7))
+    monkeypatch.setattr("torchrl_etdmpc.envs.worker._outlive_signals", looked_for.append)
+    monkeypatch.setattr(sys, "stderr", sys.stderr)  # comes back
+    make_in_worker(partial(own, get_task("own-pendulum")), os.getpid() if is_owner else os.getppid())
+    assert looked_for == ([] if is_owner else [7])
+    assert isinstance(sys.stderr, SilentWithoutOwner) != is_owner
 
 
 def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
@@ -292,7 +306,8 @@ def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
     sentinel, owner = multiprocessing.Pipe(duplex=False)
     text = io.StringIO()
     stderr = SilentWithoutOwner(text, sentinel.fileno())
-    stderr.write("a warning")
+    assert stderr.write("a warning") == len("a warning")
+    stderr.flush()
     owner.close()  # as the system does when the owner's process ends
     with pytest.raises(LeftError):
         print("Traceback", file=stderr)
