@@ -3,6 +3,8 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import importlib.util
+import logging
+import warnings
 
 import numpy as np
 import pytest
@@ -310,6 +312,26 @@ def test_parallel_environments_have_seeds_of_their_own_and_repeat(two_walkers):
 def test_making_an_environment_prints_nothing(capfd):
     make_env("cheetah-run", seed=0).rollout(2)
     assert capfd.readouterr() == ("", "")
+
+
+def test_notices_are_hidden_while_a_task_is_made_and_shown_before_and_after(monkeypatch, caplog):
+    from absl import logging as absl_logging
+    from dm_control import suite
+
+    load = suite.load
+
+    def noisy(*args, **options):
+        warnings.warn("an old attribute", stacklevel=2)
+        absl_logging.warning("an old attribute")
+        return load(*args, **options)
+
+    monkeypatch.setattr(suite, "load", noisy)
+    # absl's own handler would print them as well.
+    monkeypatch.setattr(absl_logging.get_absl_logger(), "handlers", [logging.NullHandler()])
+    absl_logging.warning("before")
+    make_env("pendulum-swingup")
+    absl_logging.warning("after")
+    assert caplog.messages == ["before", "after"]
 
 
 def test_a_missing_dm_control_is_one_line_that_says_what_to_install(monkeypatch):
