@@ -231,6 +231,9 @@ def test_a_next_observation_that_is_missing_at_the_end_of_a_slice_is_refused(mak
     slices["collector", "mask"] = torch.ones(slices.shape, dtype=torch.bool)
     slices["collector", "mask"][1, -1] = False
     loss(slices)
+    slices["next", "observation"][1, -2] = float("nan")  # of the last step that counts
+    with pytest.raises(ValueError, match="at the last step of a slice"):
+        loss(slices)
 
 
 def test_a_termination_head_needs_the_flags(make_world_model, make_loss, slices):

@@ -76,8 +76,9 @@ def refuse_unknown_ends(
         ends |= done.reshape(shape).bool()
     last = ends.clone()
     last[:, -1] = True
+    if counts is not None:  # the last one that counts; those behind it repeat another
+        last[:, :-1] |= ~counts[:, 1:]
     for what, rows in ((f"where {done_key!r} is True", ends), ("at the last step of a slice", last)):
-        rows = rows if counts is None else rows & counts
         if rows.any() and not _all_finite(entries["next_observation"], rows):
             raise ValueError(
                 f"{key!r} is not finite {what}: an environment with auto_reset=True has lost the last observations "
