@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +19,7 @@ import torch
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.checkpoints import CheckpointError  # noqa: E402
+from torchrl_etdmpc.checkpoints import CheckpointError, DamagedBufferError  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     RunInterrupted,
@@ -26,6 +27,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     load_agent,
     read_agent_file,
 )
+from torchrl_etdmpc.training.run_checkpoints import RunCheckpoints  # noqa: E402
 
 
 def rows_of_the_newest(checkpoints: Path) -> Path:
@@ -284,6 +286,51 @@ def test_too_little_of_a_buffer_is_refused(tmp_path, finished, small_config, mak
         pytest.raises(CheckpointError, match=r"^cannot resume: 0 rows of the buffer are left, fewer than the 24 "),
     ):
         make_run(small_config(resume="weights"), run_dir, resume=True)
+
+
+def restored(tmp_path: Path, config: Any, rows: int, frames: int) -> list[int]:
+    """The seeds that a collector which begins fresh gets where a run goes on with so many rows and decisions."""
+
+    class Store:
+        def load(self, parts: Any, replay: Any) -> Path:
+            if config.resume == "weights":
+                raise DamagedBufferError("the buffer is damaged.")
+            return tmp_path
+
+        def salvage(self, parts: Any, replay: Any) -> Path:
+            assert list(parts) == ["agent"]  # the sampler follows the rows that are left
+            return tmp_path
+
+    seeds: list[int] = []
+    collector = SimpleNamespace(begins_fresh=config.resume != "weights", frames=frames, set_seed=seeds.append)
+    learner = SimpleNamespace(replay=range(rows), env_steps=2 * frames, collector=collector)
+    parts = dict.fromkeys(("agent", "sampler"))
+    checkpoints = RunCheckpoints(config, RunDirectory(tmp_path), learner, None, parts)
+    checkpoints.store = Store()
+    checkpoints.restore()
+    return seeds
+
+
+@pytest.mark.parametrize("resume", ["on", "weights"])
+@pytest.mark.parametrize("seed", [3, 2**32 - 1])
+def test_an_environment_that_begins_fresh_gets_a_seed_of_its_own_at_every_resume(tmp_path, small_config, resume, seed):
+    config = small_config(resume=resume, seed=seed)
+    (first,), (second,) = (restored(tmp_path, config, 70, frames) for frames in (50, 70))
+    assert first != second
+    assert not {first, second} & {seed, (seed + 10_000) % 2**32}  # the run's, and that of its evaluations
+    assert all(0 <= one < 2**32 for one in (first, second))
+
+
+@pytest.mark.parametrize(("rows", "frames", "fits"), [(24, 70, True), (23, 70, False), (10, 10, True), (9, 10, False)])
+def test_a_run_goes_on_with_as_many_rows_as_learning_begins_with_or_all_that_it_had(
+    tmp_path, small_config, rows, frames, fits
+):
+    config = small_config(resume="weights")
+    if fits:
+        assert restored(tmp_path, config, rows, frames)
+        return
+    with pytest.raises(CheckpointError, match=f"{rows} rows of the buffer are left, fewer than the {min(24, frames)} "):
+        restored(tmp_path, config, rows, frames)
 
 
 def test_a_run_that_is_asked_to_stop_on_a_full_disk_says_that_it_is_not_saved(
