@@ -22,6 +22,14 @@ def ramp(length: int, height: int, width: int) -> np.ndarray:
     return np.broadcast_to(levels[:, None, None, None], (length, height, width, 3))
 
 
+def moving_bar(length: int) -> torch.Tensor:
+    """Frames of 48 columns in which a white bar goes four columns to the right each time."""
+    frames = torch.zeros(length, 32, 48, 3, dtype=torch.uint8)
+    for number in range(length):
+        frames[number, :, 4 * number : 4 * number + 4] = 255
+    return frames
+
+
 def decode(path: Path) -> tuple[dict, list[np.ndarray]]:
     reader = imageio_ffmpeg.read_frames(str(path))
     meta = next(reader)
@@ -55,15 +63,19 @@ def test_an_odd_size_loses_its_last_row_and_column(tmp_path):
 
 def test_a_gif_shows_some_of_the_frames_and_lasts_as_long_as_all(tmp_path):
     Image = pytest.importorskip("PIL.Image")
-    frames = torch.zeros(12, 32, 48, 3, dtype=torch.uint8)
-    for number in range(12):
-        frames[number, :, 4 * number : 4 * number + 4] = 255  # a bar that moves
     shown = []
-    with Image.open(write_film(frames, tmp_path / "a.gif", fps=50)) as film:
+    with Image.open(write_film(moving_bar(12), tmp_path / "a.gif", fps=50)) as film:
         for place in range(film.n_frames):
             film.seek(place)
             shown.append((int(np.asarray(film.convert("RGB"))[0, :, 0].argmax()), film.info["duration"]))
+        assert film.info["loop"] == 0  # for ever
     assert shown == [(0, 80), (16, 80), (32, 80)]  # ms
+
+
+def test_a_slow_gif_shows_every_frame_for_its_time(tmp_path):
+    Image = pytest.importorskip("PIL.Image")
+    with Image.open(write_film(moving_bar(3), tmp_path / "a.gif", fps=5)) as film:
+        assert (film.n_frames, film.info["duration"]) == (3, 200)
 
 
 def test_an_existing_video_is_replaced(tmp_path):
@@ -78,6 +90,7 @@ def test_the_callers_frames_are_left_as_they_are(tmp_path):
     assert torch.equal(frames, before)
 
 
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
@@ -89,14 +102,19 @@ def test_the_callers_frames_are_left_as_they_are(tmp_path):
             "put the colours last.",
         ),
         (
+            np.zeros((2, 1, 8, 3), np.uint8),
+            "frames must be [T, H, W, 3] with H and W at least 2, got frame 0 of shape [1, 8, 3]; "
+            "put the colours last.",
+        ),
+        (
             [np.zeros((8, 8, 3), np.uint8), np.zeros((8, 6, 3), np.uint8)],
             "frames must all have the size of the first, [8, 8, 3], got [8, 6, 3] in frame 1; render them at one size.",
         ),
     ],
 )
-def test_wrong_frames_are_refused_in_one_line_and_leave_nothing(tmp_path, frames, message):
+def test_wrong_frames_are_refused_in_one_line_and_leave_nothing(tmp_path, frames, message, name):
     with pytest.raises(ValueError) as caught:
-        write_mp4(frames, tmp_path / "a.mp4", fps=10)
+        write_film(frames, tmp_path / name, fps=10)
     assert str(caught.value) == message
     assert list(tmp_path.iterdir()) == []
 
@@ -113,10 +131,11 @@ def test_a_renderer_that_fails_midway_leaves_the_old_video(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
 @pytest.mark.parametrize("fps", [0, -1, float("nan")])
-def test_the_frame_rate_must_be_positive(tmp_path, fps):
+def test_the_frame_rate_must_be_positive(tmp_path, fps, name):
     with pytest.raises(ValueError, match=rf"^fps must be above 0, got {fps}; 30 is usual\.$"):
-        write_mp4(ramp(2, 32, 32), tmp_path / "a.mp4", fps=fps)
+        write_film(ramp(2, 32, 32), tmp_path / name, fps=fps)
 
 
 def test_the_file_must_be_an_mp4(tmp_path):
@@ -124,10 +143,21 @@ def test_the_file_must_be_an_mp4(tmp_path):
         write_mp4(ramp(2, 32, 32), tmp_path / "a.gif", fps=10)
 
 
-def test_a_path_that_cannot_be_written_is_one_clear_line(tmp_path):
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_a_path_that_cannot_be_written_is_one_clear_line(tmp_path, name):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"a\.mp4 cannot be written \(.*\); choose another path\.$"):
-        write_mp4(ramp(2, 32, 32), tmp_path / "file" / "a.mp4", fps=10)
+    (tmp_path / name).mkdir()  # which is found when the film is there
+    for path in (tmp_path / "file" / name, tmp_path / name):
+        with pytest.raises(OSError, match=rf"{name} cannot be written \(.*\); choose another path\.$"):
+            write_film(ramp(2, 32, 32), path, fps=10)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", name}
+
+
+def test_a_folder_that_takes_no_files_is_the_reason_and_not_ffmpeg_s_end():
+    if not Path("/proc").is_dir():
+        pytest.skip("needs a folder that takes no files")
+    with pytest.raises(OSError, match=r"^path=/proc/a\.mp4 cannot be written \(No such file or directory\); choose an"):
+        write_mp4(ramp(2, 32, 32), "/proc/a.mp4", fps=10)
 
 
 def test_an_encoder_that_fails_is_noticed(tmp_path, monkeypatch):
