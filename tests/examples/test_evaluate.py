@@ -268,6 +268,22 @@ def test_a_film_ends_with_the_first_episode(tmp_path, monkeypatch, run_main, sav
     torch.testing.assert_close(films[0], torch.stack(seen[:length]).double(), rtol=0, atol=1e-6)
 
 
+def test_a_gif_has_small_frames_and_any_film_one_of_each_decision(monkeypatch, run_main, checkpoint):
+    where, films, sizes = "torchrl_etdmpc.commands.evaluate.", [], []
+
+    def render_frame(env, *size):
+        sizes.append(size)
+        return torch.zeros(2, 2, 3, dtype=torch.uint8)
+
+    monkeypatch.setattr(where + "render_frame", render_frame)
+    monkeypatch.setattr(where + "write_film", lambda frames, path, fps: films.append((len(frames), path, fps)))
+    same = (f"checkpoint={checkpoint}", "episodes=2", "policy=bare", "device=cpu", "task.episode_length=20")
+    for file in ("a.gif", "a.mp4"):
+        assert run_main(*same, f"video={file}")[0] is None
+    assert films == [(10, "a.gif", 50), (10, "a.mp4", 50)]
+    assert sizes == [(200, 200)] * 10 + [()] * 10
+
+
 @pytest.mark.parametrize("policy", ["bare", "planner"])
 @pytest.mark.parametrize("episodes", [1, 3])
 def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, save_untrained, policy, episodes):
@@ -292,6 +308,9 @@ def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, sa
         (["checkpoint=GOOD", "task=walker-walk"], "GOOD was trained with observation size 5 and action size 1, the "),
         (["checkpoint=GOOD", "task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
         (["checkpoint=GOOD", "episodes=0"], "episodes must be between 1 and 10000, got 0."),
+        (["checkpoint=GOOD", "episodes=10001"], "episodes must be between 1 and 10000, got 10001."),
+        (["checkpoint=GOOD", "seed=-1"], "seed must be in [0, 2**32 - 1], got -1."),
+        (["checkpoint=GOOD", "seed=4294967296"], "seed must be in [0, 2**32 - 1], got 4294967296."),
         (["checkpoint=GOOD", "episodes=many"], "episodes must be of type int, got 'many'."),
         (["checkpoint=GOOD", "policy=best"], "policy must be one of planner, bare, got 'best'."),
         (["checkpoint=GOOD", "policy=bare", "planner.horizon=4"], "planner.horizon changes nothing with policy=bare, "),
