@@ -72,19 +72,25 @@ def test_a_random_state_lies_within_an_episode_that_ended_early(run_main, tmp_pa
     assert max(steps) < 100
 
 
-def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, save_untrained):
+def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, monkeypatch, save_untrained):
     checkpoint = save_untrained(tmp_path / "checkpoints", 3, task=PENDULUM)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
     rows = random_slices(3, 1).flatten(0, 1)
     buffer.extend(rows)
     CheckpointStore(checkpoint.parent).save(1, {}, buffer)
-    message, _, _ = run_main(f"checkpoint={checkpoint}", "state=replay:7", "save=page")
+    with monkeypatch.context() as patch:  # which needs no simulator
+        patch.setattr("torchrl_etdmpc.commands.inspect_planner.make_env", lambda *_: pytest.fail("it was made"))
+        message, _, _ = run_main(f"checkpoint={checkpoint}", "state=replay:7", "save=page")
     assert message is None
     trace = load_trace(tmp_path / "page" / "trace.npz")
     assert trace["observation"].tolist() == rows["observation"][7].tolist()
     message, _, _ = run_main(f"checkpoint={checkpoint}", "state=replay:12", "save=other")
     assert message == "error: the row must be in [0, 12), the rows of the replay buffer, got 12."
     assert not (tmp_path / "other").exists()
+    for manifest in checkpoint.parent.glob("resume/*/manifest.json"):
+        manifest.write_text("cut off")  # the agent is whole
+    message, _, _ = run_main(f"checkpoint={checkpoint}", "state=0:0", "steps=1", "save=whole")
+    assert message is None
     row_of = f"a row of {PENDULUM}, on which the agent was trained, and none of walker-walk;"
     message, _, _ = run_main(f"checkpoint={checkpoint}", "state=replay:7", "task=walker-walk", "save=third")
     assert message is not None and message.startswith(f"error: state=replay:7 is {row_of} leave task=... out, or")
@@ -108,6 +114,8 @@ def test_a_row_of_the_saved_buffer_is_a_state(run_main, tmp_path, save_untrained
         (["planner.horizn=3"], "error: unknown setting planner.horizn; did you mean planner.horizon?"),
         (["host=0.0.0.0"], "error: host must be this machine's own address, 127.0.0.1, got '0.0.0.0'"),
         (["port=70000"], "error: port must be in [0, 65535], got 70000."),
+        (["port=-1"], "error: port must be in [0, 65535], got -1."),
+        (["seed=2147483648"], "error: seed must be in [0, 2**31 - 1], got 2147483648."),
         (["steps=0"], "error: steps must be at least 1, got 0."),
     ],
 )
