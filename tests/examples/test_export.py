@@ -71,9 +71,12 @@ def test_an_agent_of_a_gymnasium_task_is_exported(tmp_path, monkeypatch, capsys)
     save_agent(tmp_path / "last.pt", agent, config, {"env_steps": 0})
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the script; this restores it
-    monkeypatch.setattr(sys, "argv", ["export.py", "checkpoint=last.pt", "out=exported"])
+    monkeypatch.setattr(sys, "argv", ["export.py", "checkpoint=last.pt", "out=exported", "batch_size=2"])
     runpy.run_path(str(ROOT / "examples" / "export.py"), run_name="__main__")
     assert capsys.readouterr().out.startswith("gym/InvertedPendulum-v5: exported/policy.pt2 and exported/planner.pt2")
+    planner = torch.export.load(tmp_path / "exported" / "planner.pt2").module()
+    action, plan_mean = planner(torch.randn(2, 4), torch.zeros(2, 3, 1))
+    assert (action.shape, plan_mean.shape) == ((2, 1), (2, 3, 1))
     policy = torch.export.load(tmp_path / "exported" / "policy.pt2").module()
     observation = torch.randn(1, 4)
     with torch.no_grad():
