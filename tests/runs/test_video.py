@@ -78,6 +78,16 @@ def test_a_slow_gif_shows_every_frame_for_its_time(tmp_path):
         assert (film.n_frames, film.info["duration"]) == (3, 200)
 
 
+def test_a_gif_has_colours_that_come_later(tmp_path):
+    Image = pytest.importorskip("PIL.Image")
+    frames = np.zeros((40, 32, 32, 3), np.uint8)
+    frames[20:, :, :16] = (250, 30, 120)
+    with Image.open(write_film(frames, tmp_path / "a.gif", fps=10)) as film:
+        film.seek(film.n_frames - 1)
+        left, right = np.asarray(film.convert("RGB"))[0, [0, -1]].astype(int)
+    assert abs(left - (250, 30, 120)).max() < 10 and abs(right).max() < 10
+
+
 def test_an_existing_video_is_replaced(tmp_path):
     write_mp4(ramp(3, 32, 32), tmp_path / "a.mp4", fps=10)
     assert len(decode(write_mp4(ramp(5, 32, 32), tmp_path / "a.mp4", fps=10))[1]) == 5

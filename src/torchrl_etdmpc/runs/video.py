@@ -14,6 +14,7 @@ import torch
 from torchrl_etdmpc.runs.files import replacing
 
 _GIF_FPS, _GIF_COLOURS = 12.5, 64  # a GIF takes a multiple of 10 ms per picture, and grows with both
+_PALETTE_FRAMES = 16
 
 
 def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathLike[str], fps: float) -> Path:
@@ -51,7 +52,8 @@ def write_film(frames: Iterable[torch.Tensor | np.ndarray], path: str | os.PathL
             kept.append(Image.fromarray(np.ascontiguousarray(array)))
     if not kept:
         raise ValueError("frames must hold at least one frame, got none; record an episode first.")
-    palette = kept[0].quantize(_GIF_COLOURS)
+    some = kept[:: -(-len(kept) // _PALETTE_FRAMES)]  # one palette for all: what moves does not flicker
+    palette = Image.fromarray(np.concatenate([np.asarray(picture) for picture in some])).quantize(_GIF_COLOURS)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept]
     milliseconds = 10 * round(100 * every / fps)
     try:
