@@ -258,6 +258,7 @@ class Updater:
             factor = (self.grad_clip_norm / (norm + 1e-6)).clamp(max=1)  # as torch.nn.utils.clip_grad_norm_
             gradients.update({part: factor * gradients[part] for part in names})
             metrics[f"grad_norm_{name}"] = norm
+        # Departure from BMPC and TD-MPC2, whose codes step on any gradient: one that is not finite would end the run.
         skip = {name: metrics[f"grad_norm_{name}"].isfinite().logical_not().float() for name in clipped}
         if len(skip) == 2:
             skip["policy"] = torch.maximum(skip["policy"], skip["model"])
