@@ -10,8 +10,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from torchrl_etdmpc.analysis import (
     BENCHMARKS,
     Benchmark,
@@ -55,6 +53,8 @@ def report(arguments: argparse.Namespace, references: Baselines, points: Baselin
     Raises:
         ValueError, OSError: if there is nothing to report on, or no sense in what was asked for.
     """
+    import pandas as pd
+
     found, experiments, lines = read(arguments.runs)
     found, experiments, left_out = only_of_benchmark(arguments.benchmark, found, experiments)
     mixed = mixed_settings(found)
