@@ -134,6 +134,16 @@ def test_seed_curves_win_over_means_of_the_same_method_on_the_same_task_only():
     assert len(merged[merged["method"] == "BMPC"]) == len(BMPC)
 
 
+def test_a_method_of_which_two_sets_of_runs_are_published_on_a_compared_task_is_named():
+    published = pd.concat([BMPC, means("ours", lambda task, step: -1.0)])
+    note = "Published per seed and, of other runs, as means: ours; the curves per seed are used."
+    assert note in run(published=published).notes
+    elsewhere = seed_curves("ours", ours, tasks=TASKS[1:])
+    assert note not in run(elsewhere, published, tasks=TASKS[:1]).notes
+    # On the other task, which is not compared, there are both.
+    assert note in run(elsewhere, published, tasks=TASKS[1:]).notes
+
+
 def test_means_alone_can_be_compared():
     comparison = run(NO_SEEDS, pd.concat([BMPC, BMPC.assign(method="half", mean=BMPC["mean"] / 2)]))
     assert cell(comparison.areas, "half", AGGREGATE)["auc"] == pytest.approx(0.05)
@@ -196,6 +206,12 @@ def test_wherever_a_curve_is_read_a_seed_that_has_ended_does_not_count():
     assert cell(areas, "ours", walk)[["auc", "standard_error", "seeds"]].tolist() == pytest.approx(
         [0.04 * 900 / 800, 0, 2]
     )
+    # Figures read the estimates where other methods were evaluated.
+    others = pd.concat([runs, seed_curves("other", ours, steps=(0, 53_000, 100_000))])
+    published = means("BMPC", lambda *_: 1.0, steps=(0, 52_000, 200_000))
+    estimates = run(others, steps=(), **(options | {"published": published})).estimates
+    estimates = estimates.set_index(["method", "env_steps"])["mean"]
+    assert estimates[[("ours", 52_000), ("ours", 53_000)]].tolist() == [900, 900]
 
 
 def test_an_area_is_of_the_seeds_whose_curves_cover_the_grid():
@@ -225,6 +241,12 @@ def test_a_method_that_begins_late_on_one_task_is_named_with_the_latest_beginnin
     late = [seed_curves("late", ours, tasks=TASKS[:1]), seed_curves("late", ours, tasks=TASKS[1:], steps=STEPS[3:])]
     note = "Not evaluated before their first evaluation after 0 env steps, on one task at least: late from 150,000."
     assert note in run(pd.concat([OURS, *late])).notes
+
+
+def test_a_method_that_begins_after_the_budget_is_left_out_and_named_with_its_earliest_beginning():
+    late = [seed_curves("late", ours, tasks=TASKS[n : n + 1], steps=(250_000 + 50_000 * n,)) for n in range(2)]
+    notes = run(pd.concat([OURS, *late]), methods=("ours", "BMPC")).notes
+    assert "Not evaluated by 200,000 env steps on these tasks, so left out: late (from 250,000)." in notes
 
 
 def test_a_method_that_begins_at_the_budget_was_evaluated_by_it():

@@ -93,8 +93,12 @@ def test_quoted_points_stand_at_their_step_only_and_have_no_interval():
     assert set(found.xs("paper").index.get_level_values("env_steps")) == {50}  # 40 is no step of the table
 
 
-def test_a_quote_on_a_task_that_is_not_compared_counts_nowhere():
+def test_tasks_and_methods_that_are_not_compared_count_nowhere():
     pd.testing.assert_frame_equal(table(pd.concat([POINTS, quote("paper", "z", 50, 1000.0)])), table())
+    more = pd.concat([ESTIMATES, curve("a", "z", {20: 1000.0, 50: 1000.0}), curve("other", "x", {50: 1000.0})])
+    options = {"steps": (20, 50), "tasks": TASKS, "methods": ("a", "late", "between")}
+    found = returns_at(more, POINTS, **options).set_index(["method", "task", "env_steps"])
+    pd.testing.assert_frame_equal(found, table())
 
 
 def test_quotes_on_both_sides_of_a_step_are_not_joined():
@@ -127,6 +131,20 @@ def test_a_page_says_what_is_quoted_interpolated_not_evaluated_and_of_fewer_task
         "| a | 3 [-2, 8] (3) | 7 [2, 12] (3) |",
         "| late | – | 60 [58, 62] (3), 1 of 2 tasks |",  # a mean over fewer tasks is below whole ones
     ]
+
+
+def test_rows_and_columns_come_in_the_order_of_the_steps():
+    pd.testing.assert_frame_equal(table(steps=(50, 20)), table())
+    found = table().reset_index()
+    assert found[found["task"] != MEAN]["env_steps"].is_monotonic_increasing
+    names = {"tasks": TASKS, "methods": ("a",)}
+    assert overview(found[::-1], **names).startswith("| method | 20 | 50 |\n")
+
+
+def test_a_bar_in_a_name_makes_no_column():
+    found = returns_at(curve("a|b", "x", {50: 8}), no_points(), steps=[50], tasks=["x"], methods=["a|b"])
+    names = {"tasks": ["x"], "methods": ["a|b"]}
+    assert "| a\\|b |" in step_table(found, 50, **names) and "| a\\|b |" in overview(found, **names)
 
 
 def test_an_unknown_error_is_no_interval():
