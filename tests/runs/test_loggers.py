@@ -119,6 +119,23 @@ def test_a_run_that_goes_on_is_the_same_one_for_wandb(tmp_path, no_account):
     assert {record.name for record in offline_records(tmp_path / "run")} == {f"run-{known}.wandb"}
 
 
+def test_the_environment_s_mode_of_wandb_is_obeyed(tmp_path, monkeypatch, no_account):
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    train_a_little(start(tmp_path / "run", "wandb"))
+    assert offline_records(tmp_path / "run") == []
+
+
+def test_what_fails_offline_is_an_error_and_no_matter_of_the_network(tmp_path, monkeypatch, no_account):
+    from wandb.errors import Error
+
+    def fail(*_: object, **__: object) -> None:
+        raise Error("no space left")
+
+    monkeypatch.setattr("torchrl_etdmpc.runs.loggers.get_logger", fail)
+    with pytest.raises(Error, match="^no space left$"):
+        start(tmp_path / "run", "wandb")
+
+
 @pytest.mark.slow  # wandb asks for 20 seconds
 def test_a_service_that_cannot_be_reached_does_not_stop_a_run(tmp_path, monkeypatch, no_account):
     monkeypatch.setattr("torchrl_etdmpc.runs.loggers._WANDB_TIMEOUT_S", 4)

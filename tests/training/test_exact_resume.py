@@ -17,6 +17,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     read_run_config,
     resumed_config,
 )
+from torchrl_etdmpc.training.run_checkpoints import RandomState  # noqa: E402
 from torchrl_etdmpc.training.signals import WorkLeftError  # noqa: E402
 
 PLACES = {
@@ -254,6 +255,19 @@ def test_a_run_goes_on_where_there_are_fewer_gpus(tmp_path, monkeypatch, small_c
     with pytest.warns(UserWarning, match=r"saved on a machine with 99 GPUs, here are \d+: it goes on with "):
         resumed = make_run(small_config(total_env_steps=180), tmp_path / "run", resume=True)
     assert resumed.run()["env_steps"] == 180
+
+
+def test_the_gpus_that_are_here_get_their_random_numbers_back(monkeypatch):
+    state, expected, restored = RandomState().state_dict(), torch.rand(3), []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_rng_state_all", lambda states: restored.append([int(it) for it in states]))
+    first, second = torch.tensor(1), torch.tensor(2)
+    RandomState().load_state_dict(state | {"torch_cuda": [first]})
+    with pytest.warns(UserWarning, match="saved on a machine with 2 GPUs, here are 1: "):
+        RandomState().load_state_dict(state | {"torch_cuda": [first, second]})
+    assert restored == [[1], [1]]
+    assert torch.equal(torch.rand(3), expected)
 
 
 def test_the_best_agent_is_the_uninterrupted_run_s(tmp_path, finished, small_config, make_run):
