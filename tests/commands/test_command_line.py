@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import pytest
 
 pytest.importorskip("hydra")
 
-from torchrl_etdmpc.commands.command_line import as_typed, hydra_main  # noqa: E402
+from torchrl_etdmpc.commands.command_line import as_typed, hydra_main, one_line_errors  # noqa: E402
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig  # noqa: E402
+from torchrl_etdmpc.commands.export import ExportConfig  # noqa: E402
 from torchrl_etdmpc.runs.dotted import flat  # noqa: E402
 from torchrl_etdmpc.training import PRESETS, TrainConfig  # noqa: E402
 
@@ -20,11 +22,11 @@ def run_command(monkeypatch, capfd):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
 
-    def run(*arguments: str, config_class: type = TrainConfig) -> TrainConfig | str:
+    def run(*arguments: str, config_class: type = TrainConfig, config_name: str = "train") -> Any:
         received = []
         monkeypatch.setattr(sys, "argv", ["/bin/command", *arguments])
         try:
-            hydra_main("train", config_class)(received.append)()
+            hydra_main(config_name, config_class)(received.append)()
         except SystemExit as stop:
             assert capfd.readouterr() == ("", "")
             assert "\n" not in stop.code
@@ -53,6 +55,7 @@ WRONG = [
     (("planner.horizon=[1",), "planner.horizon must be a whole number, got '[1'."),
     (("planner.horizon=３",), "planner.horizon must be a whole number, got '３'."),
     (("task.episode_length=inf",), "task.episode_length must be a whole number, got 'inf'."),
+    (("task.terminates=maybe",), "task.terminates must be true or false, got 'maybe'."),
     (("planner.horizon=",), "planner.horizon must not be empty."),
     (("optim.lr=1,2",), "optim.lr must be a number, got '1,2'."),
     (("eval_policy={}",), "eval_policy must be true or false, got '{}'."),
@@ -106,11 +109,18 @@ def test_a_path_is_taken_as_it_is_typed(run_command, path):
 def test_the_home_directory_may_be_short(run_command, monkeypatch):
     monkeypatch.setenv("HOME", "/somewhere")
     assert run_command("run_dir=~/my runs").run_dir == "/somewhere/my runs"
+    export = {"config_class": ExportConfig, "config_name": "export"}
+    assert run_command("checkpoint=~/a.pt", **export).checkpoint == "/somewhere/a.pt"
 
 
 def test_quotes_of_hydra_and_its_plus_are_accepted(run_command):
     assert run_command("run_dir='a b'", "+planner.horizon=4").planner.horizon == 4
     assert run_command("run_dir='a b'").run_dir == "a b"
+
+
+def test_a_setting_may_be_taken_back(run_command):
+    config = run_command("task.episode_length=null", "checkpoint_minutes=None")
+    assert (config.episode_length, config.checkpoint_minutes) == (None, None)
 
 
 def test_the_last_of_two_values_counts(run_command):
@@ -120,8 +130,12 @@ def test_the_last_of_two_values_counts(run_command):
 def test_a_flag_may_stand_between_settings(run_command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # a sweep of Hydra's keeps a folder
     assert "horizon: 4" in run_command("preset=cpu", "--cfg", "job", "planner.horizon=4")
+    evaluate = {"config_class": EvaluateConfig, "config_name": "evaluate"}
+    assert "checkpoint: ???" in run_command("--cfg", "job", **evaluate)  # what must be given may be missing here
+    assert "run_dir: runs/3" in run_command("run_dir=runs/${seed}", "-c", "job", "--resolve", "seed=3")
     assert run_command("preset=cpu", "--multirun", "seed=3,4").seed == 3
     assert run_command("preset=cpu", "--multirun", "seed=3", "run_dir=one").run_dir == "one"
+    assert run_command("preset=cpu", "--multirun", "run_dir=one,two").run_dir == "one"
     assert run_command("preset=cpu", "--multirun", "seed=3,4", "run_dir=runs/${seed}").run_dir == "runs/3"
 
 
@@ -194,6 +208,14 @@ def test_no_two_runs_of_a_sweep_write_the_same_file(run_command, monkeypatch, ou
     )
 
 
+def test_no_two_runs_of_a_sweep_write_into_the_same_folder(run_command):
+    message = run_command("--multirun", "checkpoint=a.pt", "batch_size=1,2", config_class=ExportConfig)
+    assert message == (
+        "error: out=exported would be that of several runs, which differ in batch_size; put what differs into it, e.g. "
+        "out='exported/${batch_size}'."
+    )
+
+
 def test_a_checkpoint_that_stands_alone_is_recognised(run_command):
     message = run_command("runs/a/best.pt", config_class=EvaluateConfig)
     assert message == (
@@ -204,6 +226,7 @@ def test_a_checkpoint_that_stands_alone_is_recognised(run_command):
 def test_help_and_the_list_of_tasks_are_answered_without_a_run(run_command):
     assert "usage: command [SETTING=VALUE ...]" in run_command("--help")
     assert "planner.horizon=3 " in run_command("--help", "planner", "preset=cpu")
+    assert run_command("-h", "planner.*") == run_command("help", "planner.") == run_command("--help", "planner")
     assert "walker-walk" in run_command("task=list")
 
 
@@ -213,3 +236,13 @@ def test_messages_speak_the_words_of_make(monkeypatch):
     monkeypatch.setenv("TORCHRL_ETDMPC_MAKE", 'make train RUN_DIR="runs/a"')
     expected = 'RUN_DIR=runs/a already holds a run; go on with make train RUN_DIR="runs/a" ARGS="resume=true".'
     assert as_typed(text) == expected
+
+
+def test_an_error_without_words_is_named_by_its_kind(monkeypatch):
+    @one_line_errors
+    def fail() -> None:
+        raise NotImplementedError
+
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+    with pytest.raises(SystemExit, match="^error: NotImplementedError$"):
+        fail()

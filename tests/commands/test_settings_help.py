@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import pytest
 
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig
@@ -23,7 +25,7 @@ def test_a_meaning_comes_from_the_class_that_takes_the_argument_without_its_defa
     settings = settings_of(TrainConfig)
     assert settings["model.dropout"].meaning == "of the first hidden layer of the value heads, in [0, 1)."
     assert settings["optim.grad_clip_norm"].meaning == "largest gradient norm of the model and of the policy."
-    assert not any("`" in setting.meaning for setting in settings.values())
+    assert not any(mark in setting.meaning for setting in settings.values() for mark in '`"')
 
 
 def test_a_meaning_does_not_repeat_the_setting_s_name():
@@ -48,7 +50,35 @@ def test_the_main_help_holds_usage_main_settings_defaults_and_groups_in_80_colum
     assert "  eval_policy=false " in text
     assert all(f"  {group}.*" in text for group in groups_of(TrainConfig))
     assert "planner.horizon" not in text
-    assert max(map(len, text.splitlines())) <= 80
+    groups = help_text(TrainConfig, "", "", tuple(groups_of(TrainConfig)))
+    assert max(map(len, [*text.splitlines(), *groups.splitlines()])) <= 80
+    assert "  reanalyze.proposal_log_std_min=-2.0" in groups.splitlines()  # too long for its column
+
+
+def test_a_wide_terminal_gets_lines_that_can_be_read(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert 90 < max(map(len, help_text(TrainConfig, "Trains.", "train").splitlines())) <= 100
+
+
+def test_what_must_be_given_and_what_the_command_has_of_its_own_comes_first():
+    assert list(settings_of(ExportConfig))[:3] == ["checkpoint", "out", "batch_size"]
+
+
+@dataclass
+class Bare:
+    """A configuration without a task, without groups, and with a setting that nobody explains."""
+
+    size: int = 3
+
+
+def test_the_help_offers_what_the_command_can_do_and_nothing_else():
+    expected = {TrainConfig: "task=a,b", EvaluateConfig: "seed=1,2", ExportConfig: None, Bare: None}
+    for config_class, swept in expected.items():
+        text = help_text(config_class, "", "")
+        assert ("task=list" in text) == (config_class is not Bare)
+        assert ("--help preset=cpu" in text) == (config_class is TrainConfig)
+        assert f"--multirun {swept} " in text if swept else "--multirun" not in text
+    assert "  size=3\n" in text
 
 
 @pytest.mark.parametrize("columns", ["1", "20", "37"])
@@ -61,6 +91,7 @@ def test_a_narrow_terminal_gets_help_too(monkeypatch, columns):
 def test_a_group_or_one_setting_can_be_asked_for():
     text = help_text(TrainConfig, "", "", ("planner",))
     assert "planner.horizon=6" in text
+    assert "One of final, mean, adaptive." in " ".join(text.split())
     assert "reanalyze" not in text
     assert help_text(TrainConfig, "", "", ("optim.lr",)).splitlines() == [
         "  optim.lr=0.0003                    Learning rate."
