@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import re
@@ -179,6 +180,48 @@ def test_watching_follows_a_run_survives_a_half_written_row_and_ends_at_an_inter
     assert not list(Path().glob(".report*"))
 
 
+def test_watching_waits_for_what_is_not_there_yet_and_tries_again_what_failed(monkeypatch, run_main, capfd):
+    def block() -> None:
+        make_run("runs/one")
+        Path("report").write_text("mine")
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    between, pauses = iter([block, Path("report").unlink, interrupt]), []
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        next(between)()
+
+    Path("runs").mkdir()
+    monkeypatch.setattr(time, "sleep", sleep)
+    with pytest.raises(SystemExit, match="^130$"):
+        run_main("runs", "--reference", "--watch")
+    out, err = capfd.readouterr()
+    assert out.startswith("1 run on 1 task of Easy DMC") and out.count("\n") == 1
+    missing, blocked = err.splitlines()
+    assert missing.startswith("waiting: no runs found in runs;")
+    assert blocked == "waiting: report is a file; name a folder."
+    assert pauses == [30.0] * 3
+
+
+def test_watching_ends_when_nobody_reads_it_any_more(monkeypatch, run_main):
+    class Gone(io.TextIOWrapper):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    def sleep(seconds: float) -> None:
+        raise AssertionError("it goes on")
+
+    make_run("runs/one")
+    monkeypatch.setattr(time, "sleep", sleep)
+    with open("stdout", "wb") as file:
+        monkeypatch.setattr(sys, "stdout", Gone(file))
+        with pytest.raises(SystemExit, match="^141$"):
+            run_main("runs", "--reference", "--watch")
+
+
 @pytest.mark.parametrize("name", ["config.yaml", "eval.csv", "summary.json", "experiment.yaml"])
 def test_watching_notices_what_a_report_reads(name):
     root = make_experiment()
@@ -187,7 +230,10 @@ def test_watching_notices_what_a_report_reads(name):
     assert report_runs.stamp(runs) == before
     file = next(path for path in (root / name, root / "a" / "walker-walk" / "seed1" / name) if path.exists())
     file.write_text(file.read_text() + "\n")
-    assert report_runs.stamp(runs) != before
+    changed = report_runs.stamp(runs)
+    assert changed != before
+    os.utime(file, (0, 0))  # as when it is written again with as many characters
+    assert report_runs.stamp(runs) != changed
 
 
 def test_names_make_methods_of_folders_and_options_are_obeyed(run_main, capfd):
@@ -340,6 +386,7 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
         (("--grid-step", "-5"), "--grid-step must be positive, got -5."),
         (("--grid-step", "0"), "--grid-step must be positive, got 0."),
         (("--budget", "-1"), "--budget must be positive, got -1."),
+        (("--grid-start", "0"), "--grid-start must be positive, got 0."),
         (("--budget", "1"), "--budget=1 has no grid of equal steps; take 2."),
         (("--watch", "0"), "--watch must be positive, got 0."),
         (("--watch", "nan"), "--watch must be a number of seconds below 1e+09, got nan."),
@@ -349,6 +396,10 @@ def test_a_run_with_the_name_of_a_baseline_is_refused(refused):
         (("a=",), "runs are PATH or NAME=PATH, and neither may be empty, got 'a='."),
         (("=runs",), "runs are PATH or NAME=PATH, and neither may be empty, got '=runs'."),
         (("--grid-step", "1"), "--grid-step=1 makes more than 1,000 points of "),
+        (
+            ("--budget", "100500", "--grid-step", "1"),
+            "--grid-step=1 makes more than 1,000 points of 100,500 env steps; take 101 or more.",
+        ),
         (("--budget", f"{10**18}"), "--grid-step=100000 makes more than 1,000 points of 1,000,000,000,000,000,000 env"),
         (("--budget", f"{10**400}"), "--grid-step=100000 makes more than 1,000 points of 1"),
         (("--grid-step", "300000"), "the grid needs at least two steps"),
@@ -466,6 +517,8 @@ def test_a_run_that_has_only_begun_is_left_out_and_named(run_main, refused, capf
         "after 0 env steps); the report is report/index.md\n"
     )
     assert err == ""
+    # As coarse as can be, where no step is as long as it takes to the first evaluation.
+    assert "grid of the AUC: 0 to 100,000 every 50,000 env steps" in Path("report", "index.md").read_text()
 
 
 def test_runs_on_a_task_of_no_benchmark_say_where_they_are_compared(run_main, capfd):
@@ -473,7 +526,13 @@ def test_runs_on_a_task_of_no_benchmark_say_where_they_are_compared(run_main, ca
     make_run("runs/a", task="gym/Pendulum-v1", text=HEADER + "".join(rows))
     make_run("runs/b", task="gym/Pendulum-v1", seed=2, text=HEADER + "".join(rows[:2]))
     run_main("runs")
-    assert "up to 10,000 env steps, compared at 2,000, which all of them reach; 1 missing" in capfd.readouterr().out
+    out, err = capfd.readouterr()
+    assert "up to 10,000 env steps, compared at 2,000, which all of them reach; 1 missing" in out
+    assert err == ""  # the files of baselines that come with the package need not fit
+    Path("own.csv").write_text(PER_SEED + "".join(f"x,gym/Pendulum-v1,1,{t},{t}\n" for t in (0, 1000, 2000)))
+    run_main("runs", "--reference", "own.csv")
+    assert capfd.readouterr().err == ""
+    assert float(read_table(Path("report", "final.csv"))["gym/Pendulum-v1"]["x"]) == 2000
 
 
 def test_runs_that_end_at_the_benchmark_s_budget_have_its_usual_grid(run_main):
@@ -481,6 +540,25 @@ def test_runs_that_end_at_the_benchmark_s_budget_have_its_usual_grid(run_main):
     make_run("runs/a", text=HEADER + "".join(rows))
     run_main("runs", "--reference")
     assert "grid of the AUC: 100,000 to 200,000 every 100,000 env steps" in Path("report", "index.md").read_text()
+
+
+def test_runs_that_go_beyond_the_benchmark_s_budget_say_where_they_are_compared(run_main, capfd):
+    rows = (f"{steps},{steps // 2},7,1.0,{steps // 100},0.5,10\n" for steps in range(50_000, 250_001, 50_000))
+    make_run("runs/a", text=HEADER + "".join(rows))
+    run_main("runs", "--reference")
+    assert "up to 250,000 env steps, compared at 200,000, which all of them reach" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("last", "grid"),
+    [(200_000, "50,000 to 200,000 every 50,000"), (10_007, "5,003 to 10,006 every 5,003")],  # a prime has no steps
+)
+def test_the_grid_of_a_task_of_no_benchmark_is_that_of_its_evaluations(run_main, last, grid):
+    rows = (f"{steps},{steps},7,1.0,{steps},0.5,10\n" for steps in range(last // 4, last + 1, last // 4))
+    text = "".join(rows) if last % 4 == 0 else f"2000,2000,7,1.0,3,0.5,10\n{last},{last},7,1.0,5,0.5,10\n"
+    make_run("runs/a", task="gym/Pendulum-v1", text=HEADER + text)
+    run_main("runs", "--reference")
+    assert f"grid of the AUC: {grid} env steps" in Path("report", "index.md").read_text()
 
 
 def test_a_budget_of_one_usual_step_has_a_finer_grid(run_main):
@@ -512,9 +590,11 @@ def test_a_small_budget_needs_no_step_of_the_grid(run_main, capfd):
     assert float(read_table(Path("report", "final.csv"))["walker-walk"]["cpu"]) == 200
 
 
-def test_a_file_in_the_place_of_the_report_is_named(refused):
+def test_a_file_in_the_place_of_the_report_is_named(monkeypatch, tmp_path, refused):
     make_run("runs/a")
     Path("notes.txt").write_text("mine")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert refused("runs", "--out", "~/notes.txt") == "--out=~/notes.txt is a file; name a folder."
     assert refused("runs", "--out", "notes.txt") == "--out=notes.txt is a file; name a folder."
 
 
@@ -598,6 +678,8 @@ def test_the_home_directory_may_be_short(monkeypatch, tmp_path, run_main, capfd)
     run_main("~/my runs", "--out", "~/a report", "--reference")
     assert (tmp_path / "a report" / "index.md").is_file()
     assert report_runs.named("mine=~/my runs") == ("mine", f"{tmp_path}/my runs")
+    Path("mine=runs").mkdir()
+    assert report_runs.named("~/mine=runs") == (None, f"{tmp_path}/mine=runs")
 
 
 def make_experiment(root: str = "runs/exp", *, seeds: tuple[int, ...] = (1, 2)) -> Path:
@@ -656,6 +738,11 @@ def test_variants_of_an_experiment_are_compared_in_pairs_at_its_budget(run_main,
     assert [row["base"] for row in read_rows("paired.csv")] == ["a"] * 3
     run_main("runs/exp", "--paired", "b")
     assert [float(row["difference"]) for row in read_rows("paired.csv")][:2] == [-10, -10]
+    plan.write_text(json.dumps({**json.loads(plan.read_text()), "base": "c", "variants": {"c": {}, "b": {}, "a": {}}}))
+    run_main("runs/exp", "--reference")
+    assert {row["base"] for row in read_rows("paired.csv")} == {"b"}  # the first of those that have runs
+    page = Path("report", "index.md").read_text()
+    assert "- The experiment's base c has no runs here.\n" in page and "c has no curve" not in page
 
 
 def test_runs_below_somebody_else_s_experiment_are_no_variants_of_it(run_main, capfd):
@@ -723,6 +810,16 @@ def test_of_many_missing_runs_the_line_names_five():
     assert report_runs.missing(list("abcdefg")) == "; 7 missing or unfinished (a; b; c; d; e; and 2 more)"
 
 
+def test_a_plan_for_tasks_without_runs_does_not_count(run_main):
+    """The plan is the budget of each task's benchmark, and that of walker-walk is another one."""
+    for seed, last in ((1, 600_000), (2, 400_000)):
+        rows = (f"{t},{t // 2},7,1.0,{t // 1000},0.5,10\n" for t in range(100_000, last + 1, 100_000))
+        make_run(f"runs/exp/a/dog-run/seed{seed}", task="dog-run", seed=seed, text=HEADER + "".join(rows))
+    Path("runs/exp/experiment.yaml").write_text("{variants: [a], tasks: [walker-walk, dog-run], seeds: [1, 2]}")
+    run_main("runs/exp", "--reference")
+    assert float(read_table(Path("report", "final.csv"))["dog-run"]["a"]) == 600  # of the seed that is there
+
+
 def test_a_plan_that_no_run_has_reached_yet_is_compared_where_all_are(run_main, capfd):
     root = make_experiment()
     plan = root / "experiment.yaml"
@@ -737,6 +834,9 @@ def test_a_part_of_an_experiment_misses_nothing_of_the_rest_and_a_bad_plan_is_on
     run_main("runs/exp/b")
     assert "missing" not in capfd.readouterr().out
     assert "b" in read_table(Path("report", "final.csv"))["walker-walk"]
+    run_main("mine=runs/exp/b", "--reference")
+    assert {"mine", "b"} & set(read_table(Path("report", "final.csv"))["walker-walk"]) == {"mine"}
+    capfd.readouterr()
     (root / "experiment.yaml").write_text("variants:")
     run_main("runs/exp")
     out, err = capfd.readouterr()
@@ -806,12 +906,15 @@ def test_runs_that_spell_out_what_the_task_has_anyway_are_not_changed_ones(run_m
 def test_what_a_run_changes_of_one_task_is_said_whatever_it_does_on_others(run_main):
     make_run("runs/a")
     make_run("runs/b", task="walker-stand")
-    with open("runs/a/config.yaml", "a") as file:
-        file.write("episode_length: 100\n")
+    make_run("runs/c", task="cup-catch", text=HEADER + "0,0,7,1.0,3,0.5,10\n")  # has only begun
+    for name in "ac":
+        with open(f"runs/{name}/config.yaml", "a") as file:
+            file.write("episode_length: 100\n")
     run_main("runs", "--reference")
     page = Path("report", "index.md").read_text()
     assert "- walker-walk was run with episode_length=100, not as the benchmark has it.\n" in page
-    assert "walker-stand was run with" not in page
+    assert "walker-stand was run with" not in page and "cup-catch was run with" not in page
+    assert "- Nothing published stands beside walker-walk: returns" in page
 
 
 def test_runs_of_shorter_episodes_stand_beside_nothing_published(run_main):
@@ -864,6 +967,8 @@ def test_a_folder_that_is_named_twice_counts_once(run_main, capfd):
     make_run("runs/a")
     run_main("runs", "runs/a", "runs/../runs/a")
     assert capfd.readouterr().out.startswith("1 run on 1 task of Easy DMC")
+    run_main("one=runs", "other=runs/a", "--reference")  # of two names there are two
+    assert capfd.readouterr().out.startswith("2 runs on 1 task of Easy DMC")
 
 
 def test_a_file_of_baselines_may_have_numbers_for_names_and_says_if_it_is_of_no_use(run_main, capfd):
@@ -916,11 +1021,12 @@ def test_runs_are_not_called_like_a_column_of_the_tables(refused, name):
     assert refused(f"{name}=runs/a") == f"{name} is a column of the tables; give the runs another name (NAME=PATH)."
 
 
-def test_a_step_of_the_grid_that_was_given_is_taken(run_main):
+def test_a_step_and_a_start_of_the_grid_that_were_given_are_taken(run_main):
     rows = (f"{steps},{steps},7,1.0,{steps // 10},0.5,10\n" for steps in range(0, 7_008, 1_001))
     make_run("runs/a", task="gym/Pendulum-v1", text=HEADER + "".join(rows))
-    run_main("runs", "--budget", "7007", "--grid-step", "1001", "--out", "out")  # 10, 5, 4, 3, 2 do not divide it
-    assert "every 1,001 env steps" in Path("out", "index.md").read_text()
+    options = ("--budget", "7007", "--grid-step", "1001")  # 10, 5, 4, 3, 2 do not divide it
+    run_main("runs", *options, "--grid-start", "2002", "--out", "out")
+    assert "grid of the AUC: 2,002 to 7,007 every 1,001 env steps" in Path("out", "index.md").read_text()
 
 
 def test_a_budget_without_a_grid_is_refused(refused):

@@ -29,7 +29,7 @@ def choose_benchmark(name: str | None, runs: Table) -> Benchmark:
         return benchmark_of(present)
     if len(own) < len(present):
         raise ValueError(f"{own[0]} is of no benchmark, other runs are; report them apart, or pass --benchmark.")
-    return own_benchmark(own, max(reached(runs), 1))
+    return own_benchmark(own, reached(runs))
 
 
 def choose_budget(
@@ -53,7 +53,7 @@ def choose_budget(
     elif len(planned) == 1:  # a run that ended early is named, and does not shorten the others
         (budget,) = planned
     else:
-        budget = min(least, benchmark.budget)
+        budget = least
     step = asked_step or step
     if step and budget // step > MOST_POINTS:
         raise ValueError(
