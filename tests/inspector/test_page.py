@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import socket
@@ -111,6 +112,8 @@ def test_much_pessimism_can_be_reached_from_little(value):
 
 def test_the_page_answers_this_machine_only(served):
     assert urlopen(served.address).status == 200
+    for name in ("localhost", "localhost:8050", "[::1]", "[::1]:8050"):
+        assert urlopen(Request(served.address, headers={"Host": name})).status == 200
     with pytest.raises(HTTPError, match="403") as caught:
         urlopen(Request(served.address, headers={"Host": "evil.example:8050"}))
     caught.value.close()
@@ -131,6 +134,12 @@ def test_a_port_in_use_is_one_line():
         port = other.getsockname()[1]
         with pytest.raises(OSError, match=f"port={port} cannot be used .*; choose another one, e.g. port={port + 1}"):
             serve(None, port=port)
+    with socket.socket() as other:
+        with contextlib.suppress(OSError):  # somebody else has it
+            other.bind(("127.0.0.1", 65_535))
+            other.listen()
+        with pytest.raises(OSError, match="port=65535 cannot be used .*; choose another one, e.g. port=8050"):
+            serve(None, port=65_535)
 
 
 def test_an_address_of_another_machine_is_one_line():
