@@ -556,7 +556,9 @@ def test_runs_that_go_beyond_the_benchmark_s_budget_say_where_they_are_compared(
 def test_the_grid_of_a_task_of_no_benchmark_is_that_of_its_evaluations(run_main, last, grid):
     rows = (f"{steps},{steps},7,1.0,{steps},0.5,10\n" for steps in range(last // 4, last + 1, last // 4))
     text = "".join(rows) if last % 4 == 0 else f"2000,2000,7,1.0,3,0.5,10\n{last},{last},7,1.0,5,0.5,10\n"
-    make_run("runs/a", task="gym/Pendulum-v1", text=HEADER + text)
+    make_run("runs/exp/a/pendulum/seed1", task="gym/Pendulum-v1", text=HEADER + text)
+    # Neither a plan nor a benchmark has a budget for it.
+    Path("runs/exp/experiment.yaml").write_text("{variants: [a], tasks: [gym/Pendulum-v1], seeds: [1]}")
     run_main("runs", "--reference")
     assert f"grid of the AUC: {grid} env steps" in Path("report", "index.md").read_text()
 
