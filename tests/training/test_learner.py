@@ -136,7 +136,7 @@ def test_a_row_counts_the_planned_decisions_whose_plan_fell_back(tmp_path, tiny_
 
 
 @pytest.mark.parametrize("reward", [50.0, 60.0, -60.0])
-def test_rewards_that_the_bins_cannot_say_are_told_once(tmp_path, reward, tiny_config, make_run):
+def test_rewards_that_the_bins_cannot_say_are_told_once(tmp_path, reward, tiny_config, make_run, user_warnings):
     def pay(after: TensorDictBase) -> None:
         after["reward"] = torch.full_like(after["reward"], reward)
 
@@ -146,7 +146,7 @@ def test_rewards_that_the_bins_cannot_say_are_told_once(tmp_path, reward, tiny_c
     with said if abs(reward) > 53.6 else contextlib.nullcontext() as warned:
         for _ in range(5):
             learner.step()
-    assert warned is None or len(warned) == 1
+    assert warned is None or len(user_warnings(warned)) == 1
 
 
 def test_value_targets_that_the_bins_cannot_say_are_told(tmp_path, tiny_config, make_run):
@@ -189,7 +189,9 @@ def test_a_task_that_terminates_although_it_is_said_not_to_is_an_error(tmp_path,
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
-def test_first_episodes_that_are_cut_before_the_told_limit_are_told_once(tmp_path, num_envs, tiny_config, make_run):
+def test_first_episodes_that_are_cut_before_the_told_limit_are_told_once(
+    tmp_path, num_envs, tiny_config, make_run, user_warnings
+):
     config = tiny_config(num_envs=num_envs, total_env_steps=160 * num_envs)
     learner = make_run(config, tmp_path, StepCounter(8)).learner
     for _ in range(7):
@@ -200,7 +202,7 @@ def test_first_episodes_that_are_cut_before_the_told_limit_are_told_once(tmp_pat
     )
     with pytest.warns(UserWarning) as told:
         learner.step()
-    assert [str(warning.message) for warning in told] == [expected]
+    assert user_warnings(told) == [expected]
     for _ in range(40):  # with warnings as errors
         learner.step()
 

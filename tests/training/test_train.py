@@ -338,7 +338,7 @@ class BreakingReward(Transform):
 
 @pytest.mark.parametrize(("steps", "updates"), [(10, 0), (33, 7 + 2 * 3)], ids=["while seeding", "while learning"])
 def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(
-    tmp_path, steps, updates, tiny_config, make_run
+    tmp_path, steps, updates, tiny_config, make_run, user_warnings
 ):
     run = make_run(tiny_config(max_faults=3), tmp_path, BreakingReward(steps))
     message = rf"reward.* at decision step {steps} .*; training goes on with a fresh episode \(failure \d\)\.$"
@@ -347,7 +347,7 @@ def test_an_environment_that_keeps_failing_stops_the_run_after_it_was_saved(
         pytest.raises(NonFiniteError, match=rf"reward.* at decision step {steps} ") as caught,
     ):
         run.run()
-    assert len(warned) == 2
+    assert len(user_warnings(warned)) == 2
     assert "\n" not in str(caught.value)
     agent, _, counters = load_agent(tmp_path / "checkpoints" / "last.pt")
     assert (counters["decision_steps"], counters["updates"]) == (steps, updates)
@@ -375,11 +375,13 @@ class Crash(Transform):
         return tensordict_reset
 
 
-def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(tmp_path, tiny_config, make_run, read_table):
+def test_a_simulator_that_fails_now_and_then_costs_its_episodes_only(
+    tmp_path, tiny_config, make_run, read_table, user_warnings
+):
     run = make_run(tiny_config(max_faults=2, total_env_steps=240), tmp_path, Crash(5, 42, 95))
     with pytest.warns(UserWarning, match=r"^the environment failed at decision step \d+: the physics is inv") as warned:
         summary = run.run()
-    assert len(warned) == 3
+    assert len(user_warnings(warned)) == 3
     assert summary["env_steps"] == 240
     assert [row["env_steps"] for row in read_table(tmp_path / "eval.csv")] == [0, 80, 160, 240]
     assert len(run.learner.replay) == 120

@@ -323,7 +323,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def explicit_settings() -> list[str]:
     """Settings that the command line names, e.g. ``planner.horizon``, without Hydra's own."""
     names = [argument.lstrip("+").partition("=")[0] for argument in sys.argv[1:] if "=" in argument]
-    return [name for name in names if not name.startswith("hydra.")]
+    return [name for name in names if not name.startswith("hydra")]
 
 
 def _import_own_code(arguments: list[str]) -> None:
