@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -195,16 +196,26 @@ def test_where_there_are_no_locks_nobody_waits(tmp_path, monkeypatch, system):
     assert entered == [True]
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts the files that are open")
+def open_below(folder: Path) -> list[str]:
+    """The files of this process that are open, in the folder or the folder itself."""
+    found = []
+    for opened in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # of the listing itself
+            found.append(os.readlink(opened))
+    return [path for path in found if Path(path).is_relative_to(folder)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="asks which files are open")
 def test_no_file_stays_open(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    before = os.listdir("/proc/self/fd")
     write_whole(tmp_path / "file", NEW)
+    with (tmp_path / "file").open():
+        assert open_below(tmp_path) == [str(tmp_path / "file")]
     assert read_whole(tmp_path / "file") == NEW
     for path in (tmp_path / "pipe", tmp_path):
         with pytest.raises(DamagedFileError, match="is not a regular file"):
             read_whole(path)
-    assert len(os.listdir("/proc/self/fd")) == len(before)
+    assert open_below(tmp_path) == []
 
 
 def test_a_folder_in_the_place_of_which_a_file_lies_is_refused(tmp_path):
