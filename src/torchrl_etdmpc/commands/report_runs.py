@@ -53,8 +53,6 @@ def report(arguments: argparse.Namespace, references: Baselines, points: Baselin
     Raises:
         ValueError, OSError: if there is nothing to report on, or no sense in what was asked for.
     """
-    import pandas as pd
-
     found, experiments, lines = read(arguments.runs)
     found, experiments, left_out = only_of_benchmark(arguments.benchmark, found, experiments)
     mixed = mixed_settings(found)
@@ -70,25 +68,14 @@ def report(arguments: argparse.Namespace, references: Baselines, points: Baselin
     methods = [name for name in dict.fromkeys([*planned, *runs["method"]]) if name in set(runs["method"])]
     budget, grid_step = choose_budget(arguments.budget, arguments.grid_step, benchmark, runs, experiments)
 
-    unused = [
-        line
-        for kind, tables in (("curve", references), ("point", points))
-        for file, table in tables
-        if file not in (*DEFAULT_REFERENCES, *DEFAULT_POINTS)
-        for line in tasks_of_no_use(file, table, benchmark, kind)
-    ]
+    unused = files_of_no_use(references, points, benchmark)
     tell(unused)
-    # Published returns are of whole episodes.
     shorter = {run.task for run in found if any(setting.startswith("episode_length") for setting in run.changed)}
     shorter &= set(tasks)
-    beside: list[Table] = [table[table["task"].isin(set(benchmark.tasks) - shorter)] for _, table in references]
-    means = [table for table in beside if "return_mean" not in table]
-    quoted: Table = pd.concat([table for _, table in points] or [no_points()], ignore_index=True)
-    quoted = quoted[~quoted["task"].isin(shorter)]
-    refuse_clash(methods, [*beside, quoted])
-    curves = join_curves([runs, *(table for table in beside if "return_mean" in table)])
-    published = join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"])
-    baselines = evaluated_methods(curves, published, tasks=tasks, budget=budget)
+    seeds, published, quoted = baselines(references, points, benchmark, shorter)
+    refuse_clash(methods, [*seeds, published, quoted])
+    curves = join_curves([runs, *seeds])
+    others = evaluated_methods(curves, published, tasks=tasks, budget=budget)
     first = runs.groupby("method")["env_steps"].min().max()
     base, variants = choose_base(arguments.paired, runs, methods, experiments)
     comparison = compare(
@@ -96,7 +83,7 @@ def report(arguments: argparse.Namespace, references: Baselines, points: Baselin
         published,
         benchmark=benchmark,
         tasks=tasks,
-        methods=tuple(dict.fromkeys([*methods, *baselines])),
+        methods=tuple(dict.fromkeys([*methods, *others])),
         budget=budget,
         grid_step=grid_step,
         start=arguments.grid_start or int(-(-first // grid_step) * grid_step),
@@ -106,11 +93,8 @@ def report(arguments: argparse.Namespace, references: Baselines, points: Baselin
     )
     notes = [f"{line}." for line in (*left_out, *unused, *mixed)]
     notes += notes_on_tasks([run for run in found if run.task in tasks], shorter)
-    notes += [
-        f"The experiment's base {plan.base} has no runs here."
-        for plan in experiments
-        if plan.base and plan.base not in methods
-    ]
+    absent = [plan.base for plan in experiments if plan.base and plan.base not in methods]
+    notes += [f"The experiment's base {name} has no runs here." for name in absent]
     comparison = dataclasses.replace(comparison, notes=(*comparison.notes, *notes))
     incomplete = [*lines, *incomplete_runs(found, experiments, budget=budget)]
     out = Path(arguments.out).expanduser()
@@ -223,13 +207,34 @@ def refuse_clash(methods: list[str], tables: list[Table]) -> None:
         raise ValueError(f"{clash[0]} names both runs and a baseline; give the runs another name (NAME=PATH).")
 
 
-def tasks_of_no_use(file: Path | str, table: Table, benchmark: Benchmark, kind: str) -> list[str]:
-    """A line on a file's tasks that are in no benchmark and not among those compared, or on a file without any."""
-    tasks = list(dict.fromkeys(table["task"]))
-    if not set(tasks) & set(benchmark.tasks):
-        return [f"{file} has no {kind} on a task of {benchmark.name}, its tasks are {', '.join(tasks)}: left out"]
-    unknown = [task for task in tasks if not any(task in known.tasks for known in (*BENCHMARKS.values(), benchmark))]
-    return [f"{file}: no benchmark has the task {', '.join(unknown)}: left out"] if unknown else []
+def files_of_no_use(references: Baselines, points: Baselines, benchmark: Benchmark) -> list[str]:
+    """A line on a given file without a task of the comparison, or on its tasks that no benchmark has."""
+    lines = []
+    given = [(file, table, "curve") for file, table in references if file not in DEFAULT_REFERENCES]
+    given += [(file, table, "point") for file, table in points if file not in DEFAULT_POINTS]
+    for file, table, kind in given:
+        tasks = list(dict.fromkeys(table["task"]))
+        unknown = [task for task in tasks if not any(task in each.tasks for each in (*BENCHMARKS.values(), benchmark))]
+        if not set(tasks) & set(benchmark.tasks):
+            of = f"{benchmark.name}, its tasks are {', '.join(tasks)}"
+            lines.append(f"{file} has no {kind} on a task of {of}: left out")
+        elif unknown:
+            lines.append(f"{file}: no benchmark has the task {', '.join(unknown)}: left out")
+    return lines
+
+
+def baselines(
+    references: Baselines, points: Baselines, benchmark: Benchmark, shorter: set[str]
+) -> tuple[list[Table], Table, Table]:
+    """Curves per seed, curves of means and quoted means, but for tasks whose episodes are ``shorter`` than theirs."""
+    import pandas as pd
+
+    curves: list[Table] = [table[table["task"].isin(set(benchmark.tasks) - shorter)] for _, table in references]
+    quoted: Table = pd.concat([table for _, table in points] or [no_points()], ignore_index=True)
+    seeds = [table for table in curves if "return_mean" in table]
+    means = [table for table in curves if "return_mean" not in table]
+    published = join_curves(means) if means else pd.DataFrame(columns=["method", "task", "env_steps", "mean"])
+    return seeds, published, quoted[~quoted["task"].isin(shorter)]
 
 
 def notes_on_tasks(runs: list[Run], shorter: set[str]) -> list[str]:
