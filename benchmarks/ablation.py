@@ -37,6 +37,8 @@ KEPT = {"cpu-ablation": "ablation", "adaptive": "adaptive"}
 """Folder below ``RESULTS`` by the name of the experiment."""
 ENV_STEPS = 50_000
 STEPS = range(10_000, ENV_STEPS + 1, 10_000)
+LEAST_SEEDS = 3
+"""For an interval over seeds: that of two is wider than what a task can return."""
 
 
 def file_of(name: str) -> Path:
@@ -92,12 +94,30 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
     return pd.DataFrame(rows).set_index(["variant", "task", "seed"]), alone
 
 
-def mean_over_tasks(differences: pd.Series) -> tuple[float, float]:
-    """Mean of one difference per task, and half of its 95% interval (Student's t over the tasks; NaN for one)."""
+def interval(differences: pd.Series, least: int = 2) -> tuple[float, float]:
+    """Mean and half of its 95% interval (Student's t; NaN for fewer than ``least`` differences)."""
     count = len(differences)
-    if count < 2:
+    if count < least:
         return differences.mean(), float("nan")
     return differences.mean(), student.ppf(0.975, count - 1) * differences.std() / count**0.5
+
+
+def interval_over_seeds(differences: pd.Series) -> tuple[float, float]:
+    """Mean over tasks and half of its 95% interval over seeds of these tasks, several of each.
+
+    Tasks have their own variances, so the degrees of freedom are those of Welch and Satterthwaite.
+    """
+    tasks = differences.groupby("task").agg(["mean", "var", "count"])
+    mean, shares = tasks["mean"].mean(), tasks["var"] / tasks["count"]
+    if not shares.any():
+        return mean, 0.0
+    freedom = shares.sum() ** 2 / (shares**2 / (tasks["count"] - 1)).sum()
+    return mean, student.ppf(0.975, freedom) * shares.sum() ** 0.5 / len(tasks)
+
+
+def written(mean: float, half: float) -> str:
+    """``+84 [-96, +265]``, or the mean alone."""
+    return f"{mean:+.0f}" + ("" if np.isnan(half) else f" [{mean - half:+.0f}, {mean + half:+.0f}]")
 
 
 def groups(tasks: pd.Index, chosen: Sequence[str]) -> dict[str, pd.Index]:
@@ -116,8 +136,10 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
     lines = [f"# {experiment.title}", "", *__doc__.strip().split("\n\n")[-1].splitlines(), ""]
     lines += [
         f"A difference is the variant's return minus that of *{experiment.base}*, of runs with the same task and seed;",
-        "above 0 the variant is ahead. In brackets the 95% interval of the mean over tasks (Student's t over one",
-        "difference per task): it says what other tasks of this kind would show, not what other seeds would.",
+        "above 0 the variant is ahead. In brackets 95% intervals (Student's t). Those over tasks are of one difference",
+        "per task: they say what other tasks of this kind would show. Those of a task are of one difference per seed,",
+        "and that of a table's last row is of the seeds of each of its tasks: they say what other seeds would show.",
+        f"There is none for fewer than two tasks or {LEAST_SEEDS} seeds.",
         f"{', '.join(TASKS[:-1])} and {TASKS[-1]} are those that the preset was tuned on.",
         "",
         *([f"Left out, because *{experiment.base}* has no run beside them: {', '.join(alone)}.", ""] if alone else []),
@@ -134,21 +156,35 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
         for name, tasks in groups(by_task.index, experiment.tasks).items():
             cells = []
             for step in STEPS:
-                mean, half = mean_over_tasks(by_task.loc[tasks, f"variant {step}"] - by_task.loc[tasks, f"base {step}"])
-                cells.append(f"{mean:+.0f}" + ("" if np.isnan(half) else f" [{mean - half:+.0f}, {mean + half:+.0f}]"))
+                found = by_task.loc[tasks, f"variant {step}"] - by_task.loc[tasks, f"base {step}"]
+                cells.append(written(*interval(found)))
             lines.append(f"| {name} | {len(tasks)} | {' | '.join(cells)} |")
-        lines += [
-            "",
-            f"| task | seeds | {experiment.base} at {ENV_STEPS:,} | variant | difference |",
-            "|---|---|---|---|---|",
-        ]
-        for task, seeds in rows.groupby("task"):
-            mean = seeds.mean()
-            ours, theirs = mean[f"base {ENV_STEPS}"], mean[f"variant {ENV_STEPS}"]
-            numbers = ", ".join(map(str, sorted(seeds.index.get_level_values("seed"))))
-            lines.append(f"| {task} | {numbers} | {ours:.0f} | {theirs:.0f} | {theirs - ours:+.0f} |")
+        lines += ["", *tasks_table(rows, experiment)]
         lines.append("")
     return "\n".join([*lines, *returns_table(pairs, experiment), "", "![differences](differences.png)", ""])
+
+
+def tasks_table(rows: pd.DataFrame, experiment: Experiment) -> list[str]:
+    """A variant's tasks at the last step, means over the seeds that are there, and the mean of those with enough."""
+    lines = [f"| task | seeds | {experiment.base} at {ENV_STEPS:,} | variant | difference |", "|---|---|---|---|---|"]
+    returns, differences = rows[[f"base {ENV_STEPS}", f"variant {ENV_STEPS}"]], last_differences(rows)
+    for task, seeds in returns.groupby("task"):
+        numbers = ", ".join(map(str, sorted(seeds.index.get_level_values("seed"))))
+        cells = [f"{mean:.0f}" for mean in seeds.mean()] + [written(*interval(differences.loc[[task]], LEAST_SEEDS))]
+        lines.append(f"| {task} | {numbers} | {' | '.join(cells)} |")
+    counts = rows.groupby("task").size()
+    enough = [task for task, count in counts.items() if count >= LEAST_SEEDS]
+    if len(enough) > 1:
+        name = "these tasks" if len(enough) == len(counts) else f"those with {LEAST_SEEDS} seeds"
+        means = returns.groupby("task").mean().loc[enough].mean()
+        cells = [f"{mean:.0f}" for mean in means] + [written(*interval_over_seeds(differences.loc[enough]))]
+        lines.append(f"| {name} |  | {' | '.join(cells)} |")
+    return lines
+
+
+def last_differences(rows: pd.DataFrame) -> pd.Series:
+    """The variant's return minus the base's at ``ENV_STEPS``."""
+    return rows[f"variant {ENV_STEPS}"] - rows[f"base {ENV_STEPS}"]
 
 
 def returns_table(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
@@ -174,17 +210,17 @@ def in_order(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
 
 
 def draw(pairs: pd.DataFrame, experiment: Experiment) -> Figure:
-    """A panel for each variant: the difference on every task, and where there are several their mean."""
+    """A panel for each variant: the difference on every task and with every seed, and for several tasks their mean."""
     variants, tasks = in_order(pairs, experiment), sorted(pairs.index.unique("task"), reverse=True)
     figure = Figure(figsize=(1.6 + 2.6 * len(variants), 0.26 * len(tasks) + 1.5), layout="constrained")
     axes = figure.subplots(1, len(variants), squeeze=False, sharex=True, sharey=True)[0]
     for axis, variant in zip(axes, variants, strict=True):
-        by_task = pairs.loc[variant].groupby("task").mean()
-        found = by_task[f"variant {ENV_STEPS}"] - by_task[f"base {ENV_STEPS}"]
-        for task, difference in found.items():
+        found = last_differences(pairs.loc[variant])
+        for task, differences in found.groupby("task"):
             place = 1 + tasks.index(str(task))
-            axis.plot(difference, place, "o", color="#0072B2", fillstyle="none" if task in TASKS else "full")
-        mean, half = mean_over_tasks(found)
+            axis.plot(differences, [place] * len(differences), "|", color="#0072B2", alpha=0.6)
+            axis.plot(differences.mean(), place, "o", color="#0072B2", fillstyle="none" if task in TASKS else "full")
+        mean, half = interval(found.groupby("task").mean())
         if not np.isnan(half):
             axis.errorbar(mean, 0, xerr=half, fmt="D", color="black", capsize=3)
         axis.axvline(0, color="grey", linewidth=0.8)

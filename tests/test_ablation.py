@@ -52,6 +52,46 @@ def test_runs_are_paired_by_task_and_seed_and_tasks_count_alike(script, tmp_path
     assert (tmp_path / "ablation" / "differences.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_intervals_over_seeds_are_of_a_task_and_of_all_tasks(script, tmp_path, monkeypatch):
+    steps = list(script.STEPS)
+    gains = {"walker-run": [10.0, 30.0, 50.0], "hopper-stand": [0.0, 0.0, 120.0], "walker-walk": [7.0, 7.0, 7.0]}
+    for task, seeds in gains.items():
+        for seed, gain in enumerate(seeds, start=1):
+            write(tmp_path / task / f"seed{seed}", dict.fromkeys(steps, 200.0))
+            write(tmp_path / "ablation" / "one head" / task / f"seed{seed}", dict.fromkeys(steps, 200 + gain))
+            if task == "walker-run" and seed < 3:
+                write(tmp_path / "ablation" / "final depth" / task / f"seed{seed}", dict.fromkeys(steps, 200 + gain))
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only"])
+    script.main()
+    page = (tmp_path / "ablation" / "README.md").read_text()
+    # Standard errors 11.5, 40 and 0, Student's t of two degrees of freedom 4.303. Of the three tasks: a standard error
+    # of 13.9 and 2.33 degrees of freedom, t 3.768.
+    assert "| walker-run | 1, 2, 3 | 200 | 230 | +30 [-20, +80] |" in page
+    assert "| hopper-stand | 1, 2, 3 | 200 | 240 | +40 [-132, +212] |" in page
+    assert "| walker-walk | 1, 2, 3 | 200 | 207 | +7 [+7, +7] |" in page
+    assert "| these tasks |  | 200 | 226 | +26 [-27, +78] |" in page
+    assert "| walker-run | 1, 2 | 200 | 220 | +20 |" in page
+    assert page.count("these tasks") == 1
+
+
+def test_tasks_with_few_seeds_are_not_in_the_interval_over_seeds(script, tmp_path, monkeypatch):
+    gains = {"walker-run": [10.0, 30.0, 50.0], "hopper-stand": [10.0, 30.0, 50.0], "walker-walk": [100.0, 500.0]}
+    for task, seeds in gains.items():
+        for seed, gain in enumerate(seeds, start=1):
+            write(tmp_path / task / f"seed{seed}", dict.fromkeys(script.STEPS, 0.0))
+            write(tmp_path / "ablation" / "one head" / task / f"seed{seed}", dict.fromkeys(script.STEPS, gain))
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only"])
+    script.main()
+    page = (tmp_path / "ablation" / "README.md").read_text()
+    # A standard error of 11.5 / sqrt(2) and four degrees of freedom, t 2.776.
+    assert "| those with 3 seeds |  | 0 | 30 | +30 [+7, +53] |" in page
+
+
+def test_seeds_that_all_differ_alike_leave_no_doubt(script):
+    index = script.pd.MultiIndex.from_product([["walker-run", "walker-walk"], [1, 2, 3]], names=["task", "seed"])
+    assert script.interval_over_seeds(script.pd.Series(5.0, index)) == (5.0, 0.0)
+
+
 def test_what_is_kept_of_the_experiment_s_runs_leaves_out_what_is_kept_elsewhere(script, tmp_path):
     write(tmp_path / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
     for variant in ("cpu", "no reanalyze"):
