@@ -10,8 +10,8 @@ one thread. Two settings each, because a library is worth what its better one re
 Stable-Baselines3's own, `zoo` is what RL Baselines3 Zoo tuned for PyBullet's locomotion tasks (state-dependent
 exploration; hyperparameters of HalfCheetahBulletEnv). Minutes count everything but imports: evaluations too, and for
 ours compilation. Writes `benchmarks/results/cpu/race/<method>/<task>/seed<k>/` and, there, `race.png` and `README.md`,
-whose table has mean returns over seeds: after so many env steps, with the minutes until then, and within so many
-minutes, where a run that has ended keeps its last return.
+whose table has mean returns over seeds: after so many env steps, with the minutes until then, and of what each run has
+after so many minutes, where one that has ended keeps its last return.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def report(ours: list[Path]) -> str:
     curves = join_runs(runs)
     methods = [*sorted(set(curves["method"]) - {"cpu"}), "cpu"]
     styles = {method: _style(method) for method in methods}
-    clocks = [read_evaluations(run.path).assign(task=run.task, method=run.method) for run in runs]
+    clocks = [read_evaluations(run.path).assign(task=run.task, method=run.method, seed=run.seed) for run in runs]
     clock = pd.concat(clocks).assign(minutes=lambda rows: rows["wall_time_s"] / 60)
     minutes = clock.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
     found = add_interval(estimate(curves)).join(minutes, on=["task", "method", "env_steps"])
@@ -188,10 +188,11 @@ def report(ours: list[Path]) -> str:
     lines += ["|---" * (3 + len(heads)) + "|"]
     for (task, method), rows in found.groupby(["task", "method"]):
         rows = rows.set_index("env_steps")
-        cells = [f"{rows['mean'][at]:.0f} ({rows['minutes'][at]:.1f})" if at in rows.index else "–" for at in STEPS]
-        within = [rows["mean"][rows["minutes"] <= minutes] for minutes in MINUTES]
-        cells += [f"{means.iloc[-1]:.0f}" if len(means) else "–" for means in within]
         seeds = curves[(curves["task"] == task) & (curves["method"] == method)]["seed"].nunique()
+        cells = [f"{rows['mean'][at]:.0f} ({rows['minutes'][at]:.1f})" if at in rows.index else "–" for at in STEPS]
+        own = clock[(clock["task"] == task) & (clock["method"] == method)]
+        within = [own[own["minutes"] <= minutes].groupby("seed")["return_mean"].last() for minutes in MINUTES]
+        cells += [f"{each.mean():.0f}" if len(each) == seeds else "–" for each in within]
         lines.append(f"| {task} | {method} | {seeds} | " + " | ".join(cells) + " |")
     beside = [os.path.relpath(run.path, RESULTS) for run in runs if not run.path.is_relative_to(FOLDER)]
     lines += ["", f"Runs of ours, below `benchmarks/results/cpu`: {', '.join(beside)}."]

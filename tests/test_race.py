@@ -98,4 +98,13 @@ def test_a_run_is_evaluated_as_ours_are_and_stands_beside_them(script, tmp_path,
     assert "| 50,000 env steps | 100,000 env steps | 200,000 env steps | 10 minutes | 15 minutes | 25 minutes |" in page
     assert "| cartpole-swingup | cpu | 1 | 500 (10.0) | – | – | 500 | 500 | 900 |" in page  # 90,000 after 18 minutes
     assert "| cartpole-swingup | TQC (zoo) | 1 |" in page
+    slower = ours.with_name("seed2")
+    slower.mkdir()
+    (slower / "summary.json").write_text('{"task": "cartpole-swingup", "preset": "cpu", "seed": 2}')
+    rows = [f"{step},{step // 2},{step},{0.018 * step},{step // 100},1.0,10" for step in (0, 50_000, 90_000)]
+    (slower / "eval.csv").write_text("\n".join([header, *rows, ""]))
+    script.main()
+    page = (script.FOLDER / "README.md").read_text()
+    # The slower one has 500 after 15 minutes, 900 after 27: each run counts with what it has by then.
+    assert "| cartpole-swingup | cpu | 2 | 500 (12.5) | – | – | 250 | 500 | 700 |" in page
     assert (script.FOLDER / "race.png").read_bytes().startswith(b"\x89PNG")
