@@ -35,9 +35,9 @@ def report() -> str:
     lines = [
         "# TD-MPC2 at the cpu preset's size",
         "",
-        f"Made by `python benchmarks/second_critic.py`: `preset={PRESET}` on {TASK}, one thread, beside the runs of",
-        f"`preset=cpu` in `{BESIDE.relative_to(RESULTS)}`, both as the presets were with 101 bins. Return of every",
-        "evaluation (mean of 10 episodes, planner without noise) by env steps.",
+        f"Made by `python benchmarks/second_critic.py --seeds 1 2 3`: `preset={PRESET}` on {TASK}, one thread, beside",
+        f"the runs of `preset=cpu` in `{BESIDE.relative_to(RESULTS)}`, both as the presets were with 101 bins.",
+        "Return of every evaluation (mean of 10 episodes, planner without noise) by env steps.",
         "",
         "| preset | seed | " + " | ".join(f"{steps:.0f}" for steps in table.columns) + " |",
         "|---" * (2 + len(table.columns)) + "|",
