@@ -1,7 +1,7 @@
 """What else a user could pick on one CPU core: SAC and TQC of Stable-Baselines3 beside the cpu preset, by the clock.
 
     pip install --no-deps stable-baselines3==2.9.2 sb3-contrib==2.9.2
-    python benchmarks/race.py                                # all runs that are missing, one after the other (a day)
+    python benchmarks/race.py                                # what is missing, run by run: 13 hours a seed
     python benchmarks/race.py --tasks walker-walk --algorithms tqc --settings zoo --seeds 1
     python benchmarks/race.py --report-only RUN_DIRECTORY... # figure and table, beside finished runs of ours
 
