@@ -163,6 +163,12 @@ def test_on_another_device_the_policy_is_given_what_it_reads_and_no_more():
     assert policy.inputs == [{"observation"}] * 3
 
 
+def test_a_policy_may_answer_in_a_tensordict_of_its_own():
+    env = TransformedEnv(CountingEnv(20), StepCounter(max_steps=5))  # which counts on from what the state holds
+    answer = TensorDict({"action": torch.full((1,), 0.5)})
+    assert evaluate(env, lambda state: answer.clone(), episodes=1).returns.tolist() == [expected_return(5)]
+
+
 @pytest.mark.parametrize("episodes", [0, -1])
 def test_less_than_one_episode_is_refused(episodes):
     env = CountingEnv(3)

@@ -639,6 +639,20 @@ def test_a_policy_device_changes_nothing_but_where_the_policy_runs(lengths):
     assert (stored[0] == stored[1]).all()
 
 
+@pytest.mark.parametrize("lengths", [(4,), (3, 5)], ids=["one-env", "two-envs"])
+def test_a_policy_may_answer_in_a_tensordict_of_its_own(lengths):
+    stored = []
+    for own in (False, True):
+        replay, planner = make_replay(), make_planner(warm_start=False)
+        out_keys, env = planner.out_keys, make_env(lengths)
+        policy = (lambda state, act=planner, keys=out_keys: act(state.copy()).select(*keys)) if own else planner
+        collector = StepCollector(env, policy, replay_buffer=replay, total_frames=20)
+        list(collector)
+        stored.append(replay.storage[:])
+    assert set(stored[0].keys(True, True)) == set(stored[1].keys(True, True))
+    assert (stored[0] == stored[1]).all()
+
+
 def test_collection_is_reproducible_by_set_seed_and_torch_manual_seed():
     stored = []
     for seed in (1, 1, 2):

@@ -98,6 +98,21 @@ def fitting_primers(env: EnvBase, policy: nn.Module) -> list[TensorDictPrimer]:
     return [primer for part, primer in zip(parts, primers, strict=True) if getattr(part, "warm_start", True)]
 
 
+def decided(
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    tensordict: TensorDictBase,
+    policy_device: torch.device | str | None,
+    env_device: torch.device | None,
+) -> TensorDictBase:
+    """The states with what the policy makes of them, which may come in a tensordict of its own."""
+    if policy_device is None:
+        outputs = policy(tensordict)
+        return tensordict if outputs is tensordict else tensordict.update(outputs)
+    module: Any = policy
+    outputs = module(tensordict.select(*module.in_keys, strict=False).to(policy_device))
+    return tensordict.update(outputs.select(*module.out_keys, strict=False).to(env_device or "cpu"))
+
+
 def _round(
     env: EnvBase,
     policy: nn.Module,
@@ -117,12 +132,7 @@ def _round(
     _require_finite(tensordict, observed, running, "the environment", decisions)
     while running.any():
         decisions += 1
-        if policy_device is None:
-            tensordict = policy(tensordict)
-        else:
-            inputs = tensordict.select(*policy.in_keys, strict=False).to(policy_device)
-            outputs = policy(inputs).select(*policy.out_keys, strict=False)
-            tensordict = tensordict.update(outputs.to(env.device or "cpu"))
+        tensordict = decided(policy, tensordict, policy_device, env.device)
         _require_finite(tensordict, actions, running, "the policy", decisions)
         if env.batch_size:
             stepped, tensordict = env.step_and_maybe_reset(tensordict)

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
 from torchrl_etdmpc.collectors.errors import NonFiniteError, SimulatorError
-from torchrl_etdmpc.collectors.evaluate import fitting_primers
+from torchrl_etdmpc.collectors.evaluate import decided, fitting_primers
 from torchrl_etdmpc.envs.episode import (
     is_plain,
     load_simulator_state,
@@ -234,13 +234,8 @@ class StepCollector(BaseCollector):
 
     def _decide(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.in_seed_phase:
-            return self.seed_policy(tensordict)
-        policy = self.policy
-        if self.policy_device is None:
-            return policy(tensordict)
-        inputs = tensordict.select(*policy.in_keys, strict=False).to(self.policy_device)
-        outputs = policy(inputs).select(*policy.out_keys, strict=False).to(self.env.device or "cpu")
-        return tensordict.update(outputs)
+            return decided(self.seed_policy, tensordict, None, None)
+        return decided(self.policy, tensordict, self.policy_device, self.env.device)
 
     def _start(self, tensordict: TensorDictBase) -> TensorDictBase:
         ids = torch.arange(self.num_envs, device="cpu") + self._next_trajectory
