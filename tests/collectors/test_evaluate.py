@@ -169,6 +169,18 @@ def test_a_policy_may_answer_in_a_tensordict_of_its_own():
     assert evaluate(env, lambda state: answer.clone(), episodes=1).returns.tolist() == [expected_return(5)]
 
 
+def test_a_planner_that_was_told_to_explore_is_refused():
+    budget = {"horizon": 2, "num_samples": 8, "num_elites": 2, "num_proposals": 0, "warm_start": False}
+    planner, env = EnsembleMPPIPlanner(LatentEnv(LineWorld()), **budget), CountingEnv(3)
+    planner.explore = True
+    with pytest.raises(ValueError, match=r"told to explore \(planner\.explore = True\), .* set it to False or"):
+        evaluate(env, TensorDictSequential(planner), episodes=1)
+    assert env.resets == 0
+    for explore in (False, None):
+        planner.explore = explore
+        assert evaluate(env, TensorDictSequential(planner), episodes=1).lengths.tolist() == [3]
+
+
 @pytest.mark.parametrize("episodes", [0, -1])
 def test_less_than_one_episode_is_refused(episodes):
     env = CountingEnv(3)

@@ -56,7 +56,7 @@ def evaluate(
         NonFiniteError: if the environment returns a reward or an observation that is not finite, or the policy an
             action.
         ValueError: if ``episodes`` is not positive, or the environment has several rewards, or it does not fit the
-            planner's model, e.g. because its actions have other bounds.
+            planner's model, e.g. because its actions have other bounds, or the planner was told to explore.
 
     >>> from torchrl.envs import GymEnv, RewardSum, TransformedEnv
     >>> from torchrl.envs.utils import RandomPolicy
@@ -67,6 +67,11 @@ def evaluate(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
     fitting_primers(env, policy)
+    if any(getattr(part, "explore", None) is True for part in _parts(policy)):
+        raise ValueError(
+            "the planner was told to explore (planner.explore = True), and would here, too; set it to False or None, "
+            "or evaluate another planner over the same world model where this one collects in a thread."
+        )
     if len(env.reward_keys) != 1:
         raise ValueError(f"a return is the sum of one reward, the environment has {env.reward_keys}; keep one of them.")
     num_envs = max(env.batch_size.numel(), 1)
@@ -86,7 +91,7 @@ def fitting_primers(env: EnvBase, policy: nn.Module) -> list[TensorDictPrimer]:
     Raises:
         ValueError: if environment and model do not fit.
     """
-    modules: list[Any] = [*policy.modules()] if isinstance(policy, nn.Module) else [policy]
+    modules = _parts(policy)
     for part in modules:
         if hasattr(part, "check_env"):
             part.check_env(env, alone=part is policy)
@@ -96,6 +101,10 @@ def fitting_primers(env: EnvBase, policy: nn.Module) -> list[TensorDictPrimer]:
         if hasattr(primer, "check"):
             primer.check(env, alone=part is policy)
     return [primer for part, primer in zip(parts, primers, strict=True) if getattr(part, "warm_start", True)]
+
+
+def _parts(policy: Any) -> list[Any]:
+    return [*policy.modules()] if isinstance(policy, nn.Module) else [policy]
 
 
 def decided(
