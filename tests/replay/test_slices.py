@@ -4,6 +4,7 @@ import copy
 import itertools
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -708,6 +709,20 @@ def test_rows_that_are_batches_are_refused(steps):
     )
     with pytest.raises(ValueError, match=message):
         buffer.sample()
+
+
+def test_rows_that_a_collector_of_several_environments_writes_by_itself_are_flat_with_the_named_argument():
+    for options in ({}, {"postproc": lambda batch: batch.reshape(-1)}):
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(40), sampler=StepSliceSampler(3), batch_size=60)
+        env = SerialEnv(2, partial(CountingEnv, max_steps=4))
+        sizes = {"frames_per_batch": 20, "total_frames": 40, "auto_register_policy_transforms": True}
+        list(Collector(env, CountingEnvCountPolicy(env.action_spec), replay_buffer=buffer, **sizes, **options))
+        if not options:
+            with pytest.raises(ValueError, match=r"postproc=lambda batch: batch\.reshape\(-1\)"):
+                buffer.sample()
+    slices = buffer.sample().reshape(-1, 3)
+    assert (slices["observation"].diff(dim=1) == 1).all()
+    assert len(slices["collector", "traj_ids"].unique()) > 2
 
 
 def _starts_and_masks(buffer: TensorDictReplayBuffer, slice_len: int) -> dict[tuple[int, ...], tuple[bool, ...]]:

@@ -297,7 +297,8 @@ class StepSliceSampler(Sampler):
         if stored.batch_dims > 1:
             raise ValueError(
                 f"every row of the buffer is a batch {list(stored.batch_size[1:])}, but StepSliceSampler needs one "
-                "transition per row; write flat rows: buffer.extend(batch.reshape(-1))."
+                "transition per row; write flat rows: buffer.extend(batch.reshape(-1)), or where a collector of more "
+                "environments writes by itself, Collector(..., postproc=lambda batch: batch.reshape(-1))."
             )
         keys = self._id_keys(stored)
         if self.partial and stored.get(self.done_key, None) is None:
