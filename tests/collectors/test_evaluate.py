@@ -179,6 +179,9 @@ def test_a_planner_that_was_told_to_explore_is_refused():
     for explore in (False, None):
         planner.explore = explore
         assert evaluate(env, TensorDictSequential(planner), episodes=1).lengths.tolist() == [3]
+    other = TensorDictModule(torch.nn.Linear(1, 1), in_keys=["observation"], out_keys=["action"])
+    other.explore = True  # which may mean anything
+    assert evaluate(env, other, episodes=1).lengths.tolist() == [3]
 
 
 @pytest.mark.parametrize("episodes", [0, -1])

@@ -67,7 +67,8 @@ def evaluate(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
     fitting_primers(env, policy)
-    if any(getattr(part, "explore", None) is True for part in _parts(policy)):
+    planners = [part for part in _parts(policy) if hasattr(part, "make_tensordict_primer")]  # else it may mean anything
+    if any(getattr(planner, "explore", None) is True for planner in planners):
         raise ValueError(
             "the planner was told to explore (planner.explore = True), and would here, too; set it to False or None, "
             "or evaluate another planner over the same world model where this one collects in a thread."
