@@ -35,7 +35,7 @@ def shell_environment() -> dict[str, str]:
 
 
 class Script:
-    """A script in a process of its own: the part of :class:`subprocess.Popen` that the tests use.
+    """A script in a process of its own: the part of :class:`subprocess.Popen` that the tests use, and what it printed.
 
     It is forked from a process that has imported the libraries and done nothing else.
     """
@@ -61,6 +61,10 @@ class Script:
 
     def poll(self) -> int | None:
         return self.returncode
+
+    def printed(self) -> str:
+        """Standard output so far."""
+        return self._files[0].read_text()
 
     def communicate(self, timeout: float | None = None) -> tuple[str, str]:
         self._process.join(timeout)

@@ -22,11 +22,12 @@ from torchrl_etdmpc.training import load_agent, save_agent  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "examples" / "evaluate.py"
+TASK = get_task("cartpole-balance", episode_length=100)
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory, save_untrained) -> Path:
-    return save_untrained(tmp_path_factory.mktemp("run"), 5, task="cartpole-balance")
+    return save_untrained(tmp_path_factory.mktemp("run"), 5, task=TASK.name, episode_length=TASK.episode_length)
 
 
 @pytest.fixture
@@ -47,7 +48,7 @@ def test_the_planner_s_returns_are_printed_in_one_line(tmp_path, checkpoint, run
     assert process.stderr == ""
     assert list(tmp_path.iterdir()) == []
     agent, _, _ = load_agent(checkpoint)
-    env = make_env("cartpole-balance", seed=5).append_transform(agent.eval_planner.make_tensordict_primer())
+    env = make_env(TASK, seed=5).append_transform(agent.eval_planner.make_tensordict_primer())
     torch.manual_seed(5)
     assert process.stdout == closing_line(evaluate(env, agent.eval_planner, episodes=1).returns, "planner") + "\n"
 
@@ -56,17 +57,18 @@ def test_the_bare_policy_s_returns_are_printed_in_one_line(tmp_path, checkpoint,
     message, out, err = run_main(f"checkpoint={checkpoint}", "episodes=2", "policy=bare", "seed=5", "device=cpu")
     assert (message, err) == (None, "")
     agent, _, _ = load_agent(checkpoint)
-    env = make_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
+    env = make_env(TASK, seed=5, num_envs=2, parallel=False)
     assert out == closing_line(evaluate(env, BarePolicy(agent.world_model), episodes=2).returns, "bare") + "\n"
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_bare_policy_is_that_of_the_averaged_weights_if_the_agent_has_them(tmp_path, save_untrained, run_main):
-    checkpoint = save_untrained(tmp_path, 5, task="cartpole-balance", optim={"average_decay": 0.9})
+    task = {"task": TASK.name, "episode_length": TASK.episode_length}
+    checkpoint = save_untrained(tmp_path, 5, **task, optim={"average_decay": 0.9})
     agent, config, _ = load_agent(checkpoint)
     torch.nn.init.normal_(agent.world_model.policy.output.weight)  # what is trained goes on, its average stays
     save_agent(checkpoint, agent, config, {"env_steps": 400})
-    env = make_env("cartpole-balance", seed=5, num_envs=2, parallel=False)
+    env = make_env(TASK, seed=5, num_envs=2, parallel=False)
     acting = evaluate(env, BarePolicy(agent.acting_model), episodes=2).returns
     message, out, _ = run_main(f"checkpoint={checkpoint}", "episodes=2", "policy=bare", "seed=5", "device=cpu")
     assert (message, out) == (None, closing_line(acting, "bare") + "\n")
@@ -83,14 +85,14 @@ def test_every_episode_has_its_line_in_a_table(tmp_path, monkeypatch, checkpoint
     assert out.endswith(f" over 3 episodes; episodes in {tmp_path}/tables/a.csv\n")
     assert [path.name for path in tmp_path.iterdir()] == ["tables"]
     agent, _, _ = load_agent(checkpoint)
-    env = make_env("cartpole-balance", seed=5, num_envs=3, parallel=False)
+    env = make_env(TASK, seed=5, num_envs=3, parallel=False)
     played = evaluate(env, BarePolicy(agent.world_model), episodes=3)
     assert len(set(played.returns.tolist())) == 3
     table = pd.read_csv(tmp_path / "tables" / "a.csv")
     assert list(table.columns) == ["episode", "return", "decisions"]
     assert table["episode"].tolist() == [0, 1, 2]
     assert table["return"].tolist() == played.returns.tolist()
-    assert table["decisions"].tolist() == [500, 500, 500]
+    assert table["decisions"].tolist() == [50, 50, 50]
 
 
 def test_an_agent_whose_file_is_replaced_while_it_plays_loses_no_returns(tmp_path, monkeypatch, checkpoint, run_main):
@@ -103,12 +105,10 @@ def test_an_agent_whose_file_is_replaced_while_it_plays_loses_no_returns(tmp_pat
         return evaluate(*arguments, **options)
 
     monkeypatch.setattr("torchrl_etdmpc.commands.evaluate.evaluate", play_and_remove)
-    settings = ("episodes=2", "device=cpu", "planner.horizon=1", "task.episode_length=100", "csv=here.csv")
+    settings = ("episodes=2", "device=cpu", "planner.horizon=1", "task.episode_length=40", "csv=here.csv")
     message, out, err = run_main(f"checkpoint={own}", *settings)
     assert (message, err) == (None, "")
-    assert out.startswith(
-        "cartpole-balance with episode_length=100 (planner with horizon=1, trained for 400 env steps)"
-    )
+    assert out.startswith("cartpole-balance with episode_length=40 (planner with horizon=1, trained for 400 env steps)")
     assert len((tmp_path / "here.csv").read_text().splitlines()) == 3
 
 
@@ -304,22 +304,17 @@ def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, sa
         ([], "checkpoint=... is missing: an agent file, e.g. runs/"),
         (["checkpoint=nowhere.pt"], "nowhere.pt is not a file; pass a checkpoint such as "),
         (["checkpoint=noise.pt"], "noise.pt is not a readable checkpoint ("),
-        (["checkpoint=other.pt"], "other.pt is a PyTorch file but not a checkpoint of torchrl_etdmpc."),
         (["checkpoint=GOOD", "task=walker-walk"], "GOOD was trained with observation size 5 and action size 1, the "),
-        (["checkpoint=GOOD", "task=walker-wlak"], "unknown task 'walker-wlak'; did you mean walker-walk, "),
         (["checkpoint=GOOD", "episodes=0"], "episodes must be between 1 and 10000, got 0."),
         (["checkpoint=GOOD", "episodes=10001"], "episodes must be between 1 and 10000, got 10001."),
         (["checkpoint=GOOD", "seed=-1"], "seed must be in [0, 2**32 - 1], got -1."),
         (["checkpoint=GOOD", "seed=4294967296"], "seed must be in [0, 2**32 - 1], got 4294967296."),
-        (["checkpoint=GOOD", "episodes=many"], "episodes must be of type int, got 'many'."),
         (["checkpoint=GOOD", "policy=best"], "policy must be one of planner, bare, got 'best'."),
         (["checkpoint=GOOD", "policy=bare", "planner.horizon=4"], "planner.horizon changes nothing with policy=bare, "),
         (["checkpoint=GOOD", "planner.horizon=0"], "planner.horizon must be at least 1, got 0."),
-        (["checkpoint=GOOD", "planner.horizn=4"], "unknown setting planner.horizn; did you mean planner.horizon?"),
         (["checkpoint=GOOD", "video=film.avi"], "video must end in .mp4 or .gif, got 'film.avi'."),
         (["checkpoint=GOOD", "video=noise.pt/film.mp4"], "noise.pt/film.mp4 cannot be written (File exists); choose "),
         (["checkpoint=GOOD", "csv=folder.csv"], "folder.csv is a folder; name a file."),
-        (["checkpoint=GOOD", "video=folder.mp4"], "folder.mp4 is a folder; name a file."),
         (["checkpoint=GOOD", "csv=/proc/a.csv"], "/proc/a.csv cannot be written ("),
         (["checkpoint=GOOD", "csv=a.txt"], "csv must end in .csv, got 'a.txt'."),
         (["checkpoint=GOOD", "csv=noise.pt/b/a.csv"], "noise.pt/b/a.csv cannot be written (Not a directory); choose "),
@@ -330,14 +325,12 @@ def test_a_film_changes_none_of_the_episodes(tmp_path, monkeypatch, run_main, sa
 def test_a_bad_input_ends_in_one_line(tmp_path, monkeypatch, checkpoint, run_main, arguments, message):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     (tmp_path / "noise.pt").write_bytes(b"\x80\x02noise")
-    torch.save({"weight": torch.ones(3)}, tmp_path / "other.pt")
-    for folder in ("folder.csv", "folder.mp4"):
-        (tmp_path / folder).mkdir()
+    (tmp_path / "folder.csv").mkdir()
     error, out, err = run_main(*(argument.replace("GOOD", str(checkpoint)) for argument in arguments))
     assert error.startswith("error: " + message.replace("GOOD", str(checkpoint)))
     assert "\n" not in error
     assert (out, err) == ("", "")
-    assert {path.name for path in tmp_path.iterdir()} == {"noise.pt", "other.pt", "folder.csv", "folder.mp4"}
+    assert {path.name for path in tmp_path.iterdir()} == {"noise.pt", "folder.csv"}
 
 
 def test_a_machine_that_cannot_render_is_noticed_before_the_episodes(tmp_path, monkeypatch, checkpoint, run_main):
@@ -385,7 +378,6 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def test_a_film_shows_every_decision_of_the_first_episode(tmp_path, checkpoint, run_process):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     arguments = f"checkpoint={checkpoint} video=films/cartpole.mp4 episodes=2 policy=bare device=cpu".split()
-    arguments.append("task.episode_length=200")
     process = run_process("-c", SMALL_FRAMES, str(SCRIPT), *arguments, cwd=tmp_path)
     if "cannot render" in process.stderr:
         assert process.stderr.startswith("error: ")
@@ -397,7 +389,7 @@ def test_a_film_shows_every_decision_of_the_first_episode(tmp_path, checkpoint, 
     film = tmp_path / "films" / "cartpole.mp4"
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [film]
     frames, seconds = ffmpeg.count_frames_and_secs(str(film))
-    assert (frames, seconds) == (100, pytest.approx(2, abs=0.1))
+    assert (frames, seconds) == (50, pytest.approx(1, abs=0.1))
     reader = ffmpeg.read_frames(str(film))
     assert next(reader)["size"] == (64, 48)
     picture = torch.frombuffer(bytearray(next(reader)), dtype=torch.uint8)

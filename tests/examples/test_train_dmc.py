@@ -104,92 +104,65 @@ def test_the_overrides_arrive_and_the_preset_gives_the_rest(finished):
     assert config.threads == base.threads
 
 
-def test_the_same_run_directory_is_refused_and_not_touched(finished, run_script):
+def test_a_finished_run_is_not_touched(finished, monkeypatch, run_here):
     directory, _ = finished
+    monkeypatch.chdir(directory)
     before = file_hashes(directory)
-    again = run_script(SCRIPT, *SMALL_RUN, "run_dir=runs/first", cwd=directory)
-    assert again.returncode == 1
-    assert again.stdout == ""
-    run_dir = Path("runs", "first")
-    expected = (
-        f"error: run_dir={run_dir} already holds a run; go on with resume=auto, choose another run_dir or remove it.\n"
-    )
-    assert again.stderr == expected
-    assert file_hashes(directory) == before
+    changed = "optim.batch_size=8 was asked for, but this run was started with optim.batch_size=4; "
+    for typed, error, said in (
+        ([], "error: run_dir=runs/first already holds a run; go on with resume=auto, choose another run_dir or", ""),
+        (["resume=true", "optim.batch_size=8"], f"error: {changed}", ""),
+        (["resume=auto"], "None", "runs/first is finished; nothing to do\n"),
+    ):
+        message, out, err = run_here("train_dmc.py", *SMALL_RUN, "run_dir=runs/first", *typed)
+        assert str(message).startswith(error)
+        assert (out[-len(said) :] if said else out, err) == (said, "")
+        assert file_hashes(directory) == before
 
 
-# Runs the script as if the package had not been installed.
+# Runs the script where neither of these packages is installed.
 WITHOUT = """
 import importlib.machinery, runpy, sys
 find = importlib.machinery.PathFinder.find_spec
-missing = sys.argv[1]
+missing = sys.argv[1].split()
 importlib.machinery.PathFinder.find_spec = staticmethod(
-    lambda name, path=None, target=None: None if name.partition(".")[0] == missing else find(name, path, target))
+    lambda name, path=None, target=None: None if name.split(".")[0] in missing else find(name, path, target))
 sys.argv = sys.argv[2:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-@pytest.mark.parametrize(
-    ("package", "message"),
-    [
-        (
-            "dm_control",
-            "dm_control tasks need dm-control, which is missing; run: "
-            "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'",
-        ),
-        ("hydra", "this command needs hydra-core; run: pip install 'hydra-core>=1.3,<1.4'"),
-    ],
-)
-def test_a_missing_package_is_named_in_one_line(tmp_path, package, message, run_process):
-    process = run_process("-c", WITHOUT, package, str(SCRIPT), *SMALL_RUN, cwd=tmp_path)
-    assert process.returncode == 1
-    assert process.stdout == ""
-    assert process.stderr == f"error: {message}\n"
+def test_a_process_without_the_extras_names_the_first_that_it_needs_in_one_line(tmp_path, run_process):
+    process = run_process("-c", WITHOUT, "hydra dm_control", str(SCRIPT), *SMALL_RUN, cwd=tmp_path)
+    assert (process.returncode, process.stdout) == (1, "")
+    assert process.stderr == "error: this command needs hydra-core; run: pip install 'hydra-core>=1.3,<1.4'\n"
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_missing_simulator_is_named_in_one_line(tmp_path, monkeypatch, run_here):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "dm_control" else find_spec(name, *rest)
+    )
+    needed = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
+    told = f"error: dm_control tasks need dm-control, which is missing; run: {needed}"
+    assert run_here("train_dmc.py", *SMALL_RUN) == (told, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+# One of every way on which a mistake is found; what each setting refuses is in tests/training/test_config.py.
 REFUSED = [
     ("task=walker-wlak", "unknown task 'walker-wlak'; did you mean walker-walk, "),
     ("task=null", "task must be of type str, got None."),
     ("task=gym/Pendulum-v1", "train_dmc.py knows the 28 DMC tasks, not 'gym/Pendulum-v1'; use examples/train.py."),
     ("task=nowhere:make", "task 'nowhere:make': there is no module 'nowhere' on Python's path or in "),
-    ("task.action_repeat=x", "task.action_repeat must be a whole number, got 'x'."),
-    ("task.action_repeat=0", "task.action_repeat of task 'walker-walk' must be at least 1, got 0."),
-    ("task.terminates=maybe", "task.terminates must be true or false, got 'maybe'."),
     ("preset=fast", f"unknown preset 'fast'; choose one of {', '.join(PRESETS)}."),
     ("planner.horizn=3", "unknown setting planner.horizn; did you mean planner.horizon"),
-    ("+planner.horizn=3", "unknown setting planner.horizn; did you mean planner.horizon"),
-    ("planner.horizon", "a setting is written name=value, without dashes or spaces, got 'planner.horizon'."),
     ("planner.horizon=three", "planner.horizon must be of type int, got 'three'."),
     ("planner.horizon=0", "planner.horizon must be at least 1, got 0."),
-    ("planner.num_elites=600", "planner.num_elites must be at most num_samples=512, got 600."),
-    ("planner.num_proposals=600", "planner.num_proposals must be in [0, num_samples=512), got 600."),
-    ("planner.first_action=worst", "planner.first_action must be one of elite, mean, best, got 'worst'."),
-    ("planner.score=median", "planner.score must be one of final, mean, adaptive, got 'median'."),
-    ("planner.std_min=-1", "planner.std_min must be in [1e-06, std_max=2.0], got -1.0."),
-    ("planner.scoring_dtype=int8", "planner.scoring_dtype must be one of float16, bfloat16, float32, float64, got "),
-    ("reanalyze.num_elites=100", "reanalyze.num_elites must be at most num_samples=64, got 100."),
-    ("reanalyze.num_slices=0", "reanalyze.num_slices must be at least 1, got 0."),
-    ("model.latent_dim=20", "model.latent_dim must be a multiple of simnorm_dim=8, got 20; the nearest is 16."),
-    ("model.dropout=1", "model.dropout must be in [0, 1), got 1.0."),
-    ("model.activation=tanh", "model.activation must be one of mish, silu, relu, got 'tanh'."),
-    ("loss.rho=2", "loss.rho must be in (0, 1], got 2.0."),
-    ("loss.slice_len=0", "loss.slice_len must be at least 1, got 0."),
-    (
-        "loss.slice_len=1000",
-        "loss.slice_len must fit into an episode of 500 decisions (task.episode_length=1000, task.action_repeat=2), "
-        "got 1000.",
-    ),
-    ("optim.lr=0", "optim.lr must be positive, got 0.0."),
-    ("total_env_steps=5000", "total_env_steps must exceed the random phase of 5000 env steps, got 5000; raise "),
-    ("replay.capacity=2", "replay.capacity must be at least 6 with these settings, got 2."),
     ("workers=2", "unknown setting workers; the command distributed has it."),
-    ("num_envs=0", "num_envs must be at least 1, got 0."),
     ("resume=true", "run_dir=runs/walker-walk/efficient-tdmpc/seed1 holds no run to go on with; start it with "),
-    ("logger=wandb", "logger=wandb needs wandb, which is not installed; run `pip install wandb`."),
     ("device=cuda", "device=cuda needs a CUDA device and this PyTorch sees none; use device=cpu or device=auto."),
-    ("device=cuda:first", "device must be one of auto, cpu, cuda, cuda:N, got 'cuda:first'."),
     ("run_dir=taken/run", "run_dir=taken/run cannot be written (Not a directory); choose a directory that you can "),
 ]
 
@@ -197,8 +170,6 @@ REFUSED = [
 @pytest.mark.parametrize(("argument", "message"), REFUSED, ids=[argument for argument, _ in REFUSED])
 def test_a_bad_input_ends_in_one_line_and_leaves_nothing_behind(tmp_path, monkeypatch, run_here, argument, message):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    find_spec = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find_spec(name))
     if argument == "run_dir=taken/run":
         (tmp_path / "taken").write_text("a file, not a folder")
     before = file_hashes(tmp_path)
