@@ -20,24 +20,6 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
-@pytest.fixture
-def run_command(monkeypatch, capsys):
-    """Runs ``torchrl-etdmpc`` in this process; returns its exit message, stdout and stderr."""
-    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-
-    def run(*arguments: str) -> tuple[object, str, str]:
-        monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", *arguments])
-        message = None
-        try:
-            commands.main()
-        except SystemExit as stop:
-            message = stop.code
-        return message, *capsys.readouterr()
-
-    return run
-
-
 def test_the_wheel_s_command_is_the_examples_code():
     assert PROJECT["project"]["scripts"] == {"torchrl-etdmpc": "torchrl_etdmpc.commands:main"}
     names = ("train", "train_dmc", "distributed", "evaluate", "export", "report", "suite", "study", "inspect_planner")
@@ -75,22 +57,22 @@ def test_the_sdist_holds_the_checkout():
 
 
 @pytest.mark.parametrize("name", ["train", "distributed", "evaluate", "export", "report", "study", "inspect_planner"])
-def test_every_command_has_a_help_that_says_what_it_takes(run_command, name):
-    message, out, err = run_command(name, "--help")
+def test_every_command_has_a_help_that_says_what_it_takes(run_main, name):
+    message, out, err = run_main(name, "--help")
     assert message in (None, 0)
     assert err == ""
     assert f"usage: torchrl-etdmpc {name} " in out
     assert max(map(len, out.splitlines())) <= 100
 
 
-def test_without_a_command_the_commands_are_listed(run_command):
+def test_without_a_command_the_commands_are_listed(run_main):
     for arguments in ((), ("--help",)):
-        message, out, _ = run_command(*arguments)
+        message, out, _ = run_main(*arguments)
         assert message == (0 if arguments else 2)
         assert all(name in out for name in ("train", "distributed", "evaluate", "export", "report", "study"))
-    assert run_command("--version") == (0, f"torchrl-etdmpc {__version__}\n", "")
+    assert run_main("--version") == (0, f"torchrl-etdmpc {__version__}\n", "")
     known = "train, distributed, evaluate, export, report, suite, study, inspect_planner"
-    assert run_command("tran")[0] == f"error: unknown command 'tran'; choose one of {known}."
+    assert run_main("tran")[0] == f"error: unknown command 'tran'; choose one of {known}."
 
 
 @pytest.mark.parametrize(

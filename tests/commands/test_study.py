@@ -6,7 +6,7 @@ import csv
 import hashlib
 import importlib
 import json
-import sys
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -18,7 +18,6 @@ pytest.importorskip("dm_control")
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 
-from torchrl_etdmpc import commands  # noqa: E402
 from torchrl_etdmpc.commands import study as study_command  # noqa: E402
 from torchrl_etdmpc.commands.agent_command import AgentCommandConfig  # noqa: E402
 from torchrl_etdmpc.commands.study import StudyName  # noqa: E402
@@ -53,23 +52,10 @@ def checkpoint(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def study(tmp_path, monkeypatch, capfd):
+def study(tmp_path, monkeypatch, run_main):
     """Runs the command in this process, in an empty directory; returns its exit message, stdout and stderr."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # set by the command; this restores it
-    monkeypatch.setenv("MUJOCO_GL", "disable")
-    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> tuple[object, str, str]:
-        monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", "study", *arguments])
-        message = None
-        try:
-            commands.main()
-        except SystemExit as stop:
-            message = stop.code
-        return message, *capfd.readouterr()
-
-    return run
+    return partial(run_main, "study")
 
 
 def rows(file: Path) -> list[dict[str, str]]:
@@ -149,24 +135,6 @@ def test_the_checksum_is_that_of_the_file_that_was_loaded(tmp_path, checkpoint, 
     assert agent.world_model.num_dynamics == 3
 
 
-def test_a_study_whose_figure_cannot_be_drawn_costs_no_other(tmp_path, checkpoint, study, monkeypatch):
-    def figure(result):
-        raise ValueError("nothing to draw")
-
-    monkeypatch.setattr(consistency, "figure", figure)
-    message, out, _ = study("all", f"checkpoint={checkpoint}", "out=here", *FEW)
-    assert message is None
-    assert "consistency: left out: nothing to draw" in out.splitlines()
-    assert sorted(path.stem for path in (tmp_path / "here").glob("*.png")) == sorted({*NAMES} - {"consistency"})
-
-
-def test_the_name_may_be_written_as_a_setting(tmp_path, checkpoint, study):
-    message, out, err = study("study=consistency", f"checkpoint={checkpoint}", *FEW)
-    assert (message, err) == (None, "")
-    made(tmp_path / "studies", "consistency")
-    assert "consistency: studies/consistency.png" in out
-
-
 @pytest.mark.slow  # the gradients alone take seconds
 def test_all_makes_every_study(tmp_path, checkpoint, study):
     message, out, err = study("all", f"checkpoint={checkpoint}", *FEW)
@@ -204,13 +172,18 @@ def test_a_mistake_is_one_line(study, arguments, error):
     assert (out, err) == ("", "")
 
 
-def test_what_an_agent_of_one_head_cannot_show_is_left_out_and_said(study, tmp_path):
+def test_what_cannot_be_measured_or_drawn_is_left_out_and_said_and_costs_no_other_study(study, tmp_path, monkeypatch):
+    def figure(result):
+        raise ValueError("nothing to draw")
+
+    monkeypatch.setattr(consistency, "figure", figure)
     checkpoint = untrained(tmp_path, num_dynamics=1)
     message, out, _ = study("all", f"checkpoint={checkpoint}", *FEW)
     assert message is None
     assert "calibration: left out: num_dynamics must be at least 2 for heads to disagree, got 1." in out.splitlines()
-    written = {path.stem for path in Path().rglob("*.json")}
-    assert written == set(NAMES) - {"calibration"}
+    assert "consistency: left out: nothing to draw" in out.splitlines()
+    for kind in ("json", "png"):
+        assert {path.stem for path in Path("studies").glob(f"*.{kind}")} == {*NAMES} - {"calibration", "consistency"}
     message, _, _ = study("calibration", f"checkpoint={checkpoint}", *FEW)
     assert str(message) == "error: num_dynamics must be at least 2 for heads to disagree, got 1."
 
@@ -237,13 +210,15 @@ def test_no_state_looks_beyond_the_time_limit(tmp_path, study):
     assert np.load(Path("st", "cross_scoring.npz"))["episode"].tolist() == [0, 1]  # three steps ahead of the starts
 
 
-def test_plans_have_the_command_s_seed(checkpoint, study):
-    message, _, _ = study("consistency", f"checkpoint={checkpoint}", *FEW, "out=st")
-    assert message is None
+def test_plans_have_the_command_s_seed_and_the_study_s_name_may_be_written_as_a_setting(checkpoint, study):
+    message, out, err = study("study=consistency", f"checkpoint={checkpoint}", *FEW)
+    assert (message, err) == (None, "")
+    assert "consistency: studies/consistency.png" in out
+    made(Path("studies"), "consistency")
     agent, config, _ = load_agent(checkpoint)
     episodes = [play_episode(agent.eval_planner, config.task_spec, seed=seed) for seed in (4, 5)]
     states = choose_states(episodes, 6, ahead=1, seed=4)
-    change = np.load(Path("st", "consistency.npz"))["change"]
+    change = np.load(Path("studies", "consistency.npz"))["change"]
     same, other = (consistency.consistency(agent.eval_planner, states, seed=seed).change for seed in (4, 0))
     np.testing.assert_array_equal(change, same)
     assert not np.allclose(change, other)
@@ -282,16 +257,14 @@ def test_whole_plans_fit_into_the_rest_of_the_episode(checkpoint, study):
 def test_episodes_that_end_early_count_as_long_as_they_were(tmp_path, study):
     pytest.importorskip("gymnasium")
     checkpoint = untrained(tmp_path, num_dynamics=2, task="gym/InvertedPendulum-v5", observation_dim=4)
-    message, out, _ = study("all", f"checkpoint={checkpoint}", *FEW, "out=st")
-    assert message is None
+    for name in ("value_bias", "advantage", "cross_scoring"):
+        assert study(name, f"checkpoint={checkpoint}", *FEW, "out=st")[0] is None
     about = json.loads(Path("st", "cross_scoring.json").read_text(encoding="utf-8"))
     assert about["mean_return"] < 100  # of 1,000 decisions, each of which is worth 1
     true = [row for row in rows(Path("st", "cross_scoring.csv")) if row["scored_by"] == "simulator"]
     assert all(abs(float(row["gain"])) < 100 for row in true)
     played = about["mean_return"] + 1  # the decision that ends it pays nothing
     assert np.load(Path("st", "cross_scoring.npz"))["scale"] == pytest.approx(round(played) / 3)
-    assert "value_bias: left out" not in out
-    assert "advantage: left out" not in out
 
 
 @pytest.mark.parametrize(

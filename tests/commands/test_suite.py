@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
-from torchrl_etdmpc import commands
 from torchrl_etdmpc.commands import suite
 from torchrl_etdmpc.runs import RunDirectory
 from torchrl_etdmpc.suites import RunQueue, read_experiment, write_experiment
@@ -36,19 +34,12 @@ def mine(tmp_path):
 
 
 @pytest.fixture
-def call(monkeypatch, capsys, tmp_path):
+def call(monkeypatch, tmp_path, run_main):
     """Runs ``torchrl-etdmpc suite`` in this process; returns its exit message and what it printed."""
-    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "disable"))
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments: str) -> tuple[object, str]:
-        monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", "suite", *arguments])
-        message = None
-        try:
-            commands.main()
-        except SystemExit as stop:
-            message = stop.code
-        out, err = capsys.readouterr()
+        message, out, err = run_main("suite", *arguments)
         assert err == ""
         return message, out
 
