@@ -113,6 +113,11 @@ def replay_files(folder: Path) -> set[str]:
     return {entry["file"] for files in manifests for part in ("rows", "targets") for entry in files[part]}
 
 
+def replay_of(store: CheckpointStore, step: int) -> dict[str, Any]:
+    """What the manifest of a checkpoint says of the buffer."""
+    return json.loads((store.folder / "resume" / f"{step:012d}" / "manifest.json").read_text())["replay"]
+
+
 def test_what_is_loaded_is_what_was_saved_last(store):
     work = Work()
     for step in (100, 200, 350):
@@ -490,8 +495,7 @@ def test_weights_and_what_is_left_of_the_buffer_are_restored_on_request(store):
     work = Work()
     for step in range(1, 6):  # five rows each
         save(store, step, work.do())
-    rows = json.loads((store.folder / "resume" / f"{5:012d}" / "manifest.json").read_text())["replay"]["rows"]
-    damage(store.folder / "replay" / rows[1]["file"], "a flipped bit")
+    damage(store.folder / "replay" / replay_of(store, 5)["rows"][1]["file"], "a flipped bit")
     with pytest.raises(DamagedBufferError, match="is not the file that was written"):
         load(store.folder)
     again = Work()
@@ -513,11 +517,8 @@ def test_of_a_ring_that_has_wrapped_the_longest_stretch_is_left(store):
     work = Work()
     for step in range(1, 10):  # 45 rows into 30 places
         save(store, step, work.do())
-    manifest = json.loads((store.folder / "resume" / f"{9:012d}" / "manifest.json").read_text())["replay"]
-    damage(
-        store.folder / "replay" / next(entry["file"] for entry in manifest["rows"] if entry["begin"] == 35),
-        "a flipped bit",
-    )
+    file = next(entry["file"] for entry in replay_of(store, 9)["rows"] if entry["begin"] == 35)
+    damage(store.folder / "replay" / file, "a flipped bit")
     again = Work()
     with pytest.warns(UserWarning, match="20 of 30 rows"):
         CheckpointStore(store.folder).salvage(again.parts, again.buffer)
@@ -530,11 +531,8 @@ def test_rows_whose_targets_are_lost_are_left_out(store):
     work = Work()
     for step in range(1, 4):
         save(store, step, work.do())
-    manifest = json.loads((store.folder / "resume" / f"{3:012d}" / "manifest.json").read_text())["replay"]
-    damage(
-        store.folder / "replay" / next(entry["file"] for entry in manifest["targets"] if entry["part"] == 0),
-        "a flipped bit",
-    )
+    file = next(entry["file"] for entry in replay_of(store, 3)["targets"] if entry["part"] == 0)
+    damage(store.folder / "replay" / file, "a flipped bit")
     again = Work()
     with pytest.warns(UserWarning, match="5 of 15 rows"):
         CheckpointStore(store.folder).salvage(again.parts, again.buffer)

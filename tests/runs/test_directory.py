@@ -494,11 +494,11 @@ def test_the_directory_itself_may_be_a_link(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["a: &a [x]\nb: [*a, *a]", "a: &a\n  b: *a", "x" * 2**21, "[" * 5000, "a: \x00", "a: [1"]
+    "text", ["a: &a [x]\nb: [*a, *a]", "a: &a\n  b: *a", "x" * 2**21, "[" * 5000, "a: \x00", "a: [1", "\xff\xfe"]
 )
-def test_a_hostile_configuration_is_refused_in_one_line_and_quickly(tmp_path, text):
+def test_what_is_no_configuration_is_refused_in_one_line_and_quickly(tmp_path, text):
     directory = RunDirectory(tmp_path)
-    directory.config.write_text(text)
+    directory.config.write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=rf"^{directory.config} is not a configuration: .{{5,200}}$"):
         directory.read_config()
 
@@ -526,13 +526,6 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path):
             look()
         assert str(caught.value) == f"run_dir={directory} holds no run to go on with; start it with resume=off."
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("content", [b"a: [1, 2\nb", b"\xff\xfe\x00", b"a: \x00"])
-def test_a_configuration_that_is_not_yaml_is_one_clear_line(begun, content):
-    begun.config.write_bytes(content)
-    with pytest.raises(ValueError, match=r"config\.yaml is not a configuration: [^\n]+$"):
-        begun.read_config()
 
 
 def test_a_summary_ends_a_run(begun):
