@@ -100,14 +100,6 @@ def test_the_frame_nearest_to_the_state_is_marked(tmp_path):
     assert re.findall(r'class="here"><img alt="([^"]*)"', page.read_text()) == ["step 7"]
 
 
-def test_a_website_of_others_is_not_written_over(tmp_path):
-    (tmp_path / "index.html").write_text("mine")
-    (tmp_path / "data.js").write_text("mine = 1;")
-    with pytest.raises(FileExistsError, match="holds other files; choose an empty or a new folder"):
-        write_page(tmp_path, make())
-    assert (tmp_path / "index.html").read_text() == "mine"
-
-
 def test_a_page_that_was_cut_off_is_written_anew(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "page").mkdir()  # an empty folder will do
@@ -214,9 +206,11 @@ def test_a_plan_that_fell_back_has_a_page(tmp_path):
     assert "NaN" not in (page.parent / "data.js").read_text()
 
 
-def test_other_files_are_not_written_over(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="holds other files; choose an empty or a new folder"):
-        write_page(tmp_path, make())
-    with pytest.raises(FileExistsError, match="holds other files"):
-        write_page(tmp_path / "notes.txt", make())
+@pytest.mark.parametrize("files", [["notes.txt"], ["index.html", "data.js"]])  # the latter are those of a website
+def test_other_files_are_not_written_over(tmp_path, files):
+    for name in files:
+        (tmp_path / name).write_text("mine")
+    for path in (tmp_path, tmp_path / files[0]):
+        with pytest.raises(FileExistsError, match="holds other files; choose an empty or a new folder"):
+            write_page(path, make())
+    assert all((tmp_path / name).read_text() == "mine" for name in files)
