@@ -36,20 +36,18 @@ MEAN = "Mean over tasks"
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in sorted(PAGES)}
 # A block that cannot run by itself is marked as "python fragment".
 BLOCKS = [(page, code) for page, text in TEXTS.items() for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
-COMMANDS = list(
-    dict.fromkeys(
-        line.replace("\\\n", " ")
-        for text in TEXTS.values()
-        for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
-        for line in re.findall(r"(?:.*\\\n)*.*\S.*", block)
-    )
-)
+COMMANDS = [
+    line.replace("\\\n", " ")
+    for text in TEXTS.values()
+    for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
+    for line in re.findall(r"(?:.*\\\n)*.*\S.*", block)
+]
 
 
 def commands(beginning: str) -> list[str]:
     found = [shlex.join(shlex.split(command, comments=True)) for command in COMMANDS if command.startswith(beginning)]
     assert found
-    return found
+    return list(dict.fromkeys(found))
 
 
 def run_block(code: str) -> dict:

@@ -38,18 +38,18 @@ SMALL = {
 }
 
 
-def train(run_dir: Path, **changes: object) -> None:
+def small_config(run_dir: Path, **changes: object) -> TrainConfig:
     values = preset("cpu").to_dict()
     for name, value in (SMALL | {"run_dir": str(run_dir)} | changes).items():
         values[name] = values[name] | value if isinstance(value, dict) else value
-    launch(TrainConfig.from_dict(values))
+    return TrainConfig.from_dict(values)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The directory of a run, which its reader leaves as it is; who changes it takes a copy."""
     run_dir = tmp_path_factory.mktemp("trained") / "run"
-    train(run_dir)
+    launch(small_config(run_dir))
     return run_dir
 
 
@@ -99,7 +99,9 @@ def test_what_moments_cannot_go_on_with_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path), "--times", "0"])
     with pytest.raises(SystemExit, match="--every and --times must be at least 1"):
         script["main"]()
-    train(tmp_path / "averaged", total_env_steps=100, optim=SMALL["optim"] | {"average_decay": 0.9})
+    averaged = RunDirectory(tmp_path / "averaged")
+    averaged.begin(small_config(averaged.path, optim={"average_decay": 0.9}).to_dict())
+    averaged.close()
     monkeypatch.setattr("sys.argv", ["moments.py", str(tmp_path / "averaged")])
     with pytest.raises(SystemExit, match="plans with averaged weights already"):
         script["main"]()
@@ -107,7 +109,7 @@ def test_what_moments_cannot_go_on_with_is_one_line(tmp_path, monkeypatch):
 
 def test_agents_play_with_other_settings_of_the_planner(tmp_path, monkeypatch, capsys):
     for seed in (1, 2):
-        train(tmp_path / f"seed{seed}", seed=seed)
+        launch(small_config(tmp_path / f"seed{seed}", seed=seed, total_env_steps=100))
     runs, out = [str(tmp_path / f"seed{seed}") for seed in (1, 2)], tmp_path / "table.csv"
     command = ["frozen_agents.py", *runs, "--episodes", "3", "--out", str(out), "--changes", "elite"]
     script = runpy.run_path(str(BENCHMARKS / "frozen_agents.py"))
@@ -237,12 +239,12 @@ def test_what_cannot_be_planned_twice_is_one_line(tmp_path, monkeypatch):
 
 def test_what_random_actions_find_is_counted_from_the_same_starts_behind_their_beginning(tmp_path, monkeypatch):
     script = runpy.run_path(str(BENCHMARKS / "random_phase.py"))
-    options = ["--tasks", "reacher-easy", "--holds", "1", "1e9", "--episodes", "3", "--out", str(tmp_path / "out.csv")]
+    options = ["--tasks", "reacher-easy", "--holds", "1", "1e9", "--episodes", "2", "--out", str(tmp_path / "out.csv")]
     monkeypatch.setattr("sys.argv", ["random_phase.py", *options])
     script["main"]()
     table = pd.read_csv(tmp_path / "out.csv")
-    rewards = [script["random_episodes"]("reacher-easy", hold, 3) for hold in (1.0, 1e9)]
-    assert all(paid.shape == (3, 500) for paid in rewards)
+    rewards = [script["random_episodes"]("reacher-easy", hold, 2) for hold in (1.0, 1e9)]
+    assert all(paid.shape == (2, 500) for paid in rewards)
     assert torch.equal(rewards[0][:, 0], rewards[1][:, 0])  # nothing has moved far by then
     assert table["return"].tolist() == pytest.approx([paid.sum(-1).mean().item() for paid in rewards], abs=0.01)
     assert table["found"].tolist() == [sum(bool((row[25:] > 0).any()) for row in paid) for paid in rewards]

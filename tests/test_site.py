@@ -167,12 +167,11 @@ def test_values_over_wide_bins_follow_faster_as_the_study_says(monkeypatch):
     rewards = [0.99**k * (2 - 0.8 * (0.6 * 0.98**k) ** 2) for k in range(3000)]
     assert script["true_value"](0.6) == pytest.approx(sum(rewards))
     committed = pd.read_csv(ROOT / "benchmarks" / "results" / "cpu" / "sticking_values.csv", dtype={"bins": str})
-    for bins in (21, 101):
-        update, values = next(script["learned"](bins, 0.03, seed=1))
-        rows = committed[(committed["bins"] == str(bins)) & (committed["tau"] == 0.03) & (committed["seed"] == 1)]
-        row = rows[rows["updates"] == update].iloc[0]
-        # As committed, up to what rounding on another machine makes of it; between the two lie 18.
-        assert values == pytest.approx([row["value at 0"], row["value at 0.3"], row["value at 0.6"]], abs=4)
+    update, values = next(script["learned"](101, 0.03, seed=1))
+    rows = committed[(committed["bins"] == "101") & (committed["tau"] == 0.03) & (committed["seed"] == 1)]
+    row = rows[rows["updates"] == update].iloc[0]
+    # As committed, up to what rounding on another machine makes of it; from the 21 of the preset it is 18.
+    assert values == pytest.approx([row["value at 0"], row["value at 0.3"], row["value at 0.6"]], abs=4)
 
 
 def test_the_largest_falls_are_those_of_the_committed_curves(monkeypatch, tmp_path, capsys):
