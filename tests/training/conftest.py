@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, Transform
 
 from torchrl_etdmpc.envs import make_env
 from torchrl_etdmpc.runs import RunDirectory, RunLog
-from torchrl_etdmpc.training import TrainConfig, TrainingRun
+from torchrl_etdmpc.training import TrainConfig, TrainingRun, read_agent_file
 
 EPISODE = 20  # decisions; the suite's own 500 would cost more than they show
 
@@ -102,8 +102,8 @@ def read_table() -> Callable[[Path], list[dict[str, float]]]:
 
 _SMALL: dict[str, Any] = {
     "task": "cartpole-swingup",
-    "total_env_steps": 140,
-    "eval_every": 60,
+    "total_env_steps": 110,
+    "eval_every": 54,
     "eval_episodes": 2,
     "checkpoint_every": 50,
     "log_every": 20,
@@ -113,7 +113,7 @@ _SMALL: dict[str, Any] = {
 
 @pytest.fixture(scope="session")
 def small_config() -> Callable[..., TrainConfig]:
-    """Makes a configuration of three episodes and a half; checkpoints, rows and evaluations at different steps."""
+    """Makes a configuration of three episodes, the last cut off; checkpoints, rows and evaluations at other steps."""
 
     def make(**changes: Any) -> TrainConfig:
         return _tiny_config(**_SMALL | changes | {"replay": _SMALL["replay"] | changes.get("replay", {})})
@@ -127,12 +127,14 @@ def _results(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
             return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in csv.DictReader(file)]
 
     stored = run.learner.replay.storage[:]
+    best = read_agent_file(run_dir / "checkpoints" / "best.pt")
     summary = json.loads((run_dir / "summary.json").read_text())
     return {
         "train.csv": rows("train.csv"),
         "eval.csv": rows("eval.csv"),
         "summary": {key: summary[key] for key in ("env_steps", "final_return", "best_return")},
         "weights": {name: value.tolist() for name, value in run.learner.agent.loss.state_dict().items()},
+        "best": {name: value.tolist() for name, value in best["loss"].items()} | {"at": best["counters"]["updates"]},
         "updater": tree_map_only(torch.Tensor, torch.Tensor.tolist, run.learner.agent.updater.state_dict()),
         "replay": {str(key): stored.get(key).tolist() for key in stored.keys(True, True)},
         "generations": run.learner.replay.writer.generations_of(torch.arange(len(run.learner.replay))).tolist(),

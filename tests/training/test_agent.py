@@ -202,11 +202,6 @@ def test_the_update_and_every_planner_are_compiled_and_nothing_else(compiled, ti
     assert all(options == COMPILE_OPTIONS for _, options in compiled)
 
 
-def test_nothing_is_compiled_if_it_is_turned_off(compiled, tiny_agent):
-    tiny_agent(compile="off")
-    assert compiled == []
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler")
 def test_a_compiled_agent_plans_like_an_eager_one(tiny_agent):

@@ -34,18 +34,18 @@ def rows_of_the_newest(checkpoints: Path) -> Path:
     """A file of the buffer that only the newest checkpoint needs."""
     before, after = (
         json.loads((checkpoints / "resume" / f"{steps:012d}" / "manifest.json").read_text())["replay"]["rows"]
-        for steps in (100, 140)
+        for steps in (100, 110)
     )
     return checkpoints / "replay" / next(entry["file"] for entry in after if entry not in before)
 
 
-@pytest.mark.parametrize("damaged", ["agent.pt", "collector.pt", "state.pt", "manifest.json", "replay"])
+@pytest.mark.parametrize("damaged", ["state.pt", "replay"])  # of every kind: tests/checkpoints/test_store.py
 def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(
     tmp_path, finished, straight, damaged, small_config, make_run, results
 ):
     run_dir = shutil.copytree(finished, tmp_path / "run")
     checkpoints = run_dir / "checkpoints"
-    newest = checkpoints / "resume" / f"{140:012d}"
+    newest = checkpoints / "resume" / f"{110:012d}"
     file = rows_of_the_newest(checkpoints) if damaged == "replay" else newest / damaged
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.warns(UserWarning, match=r"^going on from .*/000000000100, because "):
@@ -74,11 +74,11 @@ def test_a_run_that_an_earlier_version_saved_is_refused_and_keeps_its_weights(
     with pytest.raises(CheckpointError) as caught:
         make_run(small_config(), run_dir, resume=True)
     agents = [run_dir / "checkpoints" / name for name in ("last.pt", "best.pt")]
-    assert re.match(r"cannot resume: .*/000000000140 has checkpoint format 2; this version r", str(caught.value))
+    assert re.match(r"cannot resume: .*/000000000110 has checkpoint format 2; this version r", str(caught.value))
     left = f" Start a new run; the agents of this one can still be evaluated: {agents[0]}, {agents[1]}."
     assert str(caught.value).endswith(left)
     _, _, counters = load_agent(agents[0])
-    assert counters["env_steps"] == 140
+    assert counters["env_steps"] == 110
     agents[0].write_bytes(agents[0].read_bytes()[:-100])
     with pytest.raises(CheckpointError, match=rf"can still be evaluated: {agents[1]}\.$"):
         make_run(small_config(), run_dir, resume=True)
@@ -194,15 +194,15 @@ def test_a_full_disk_costs_checkpoints_and_nothing_else(small_disk, straight, sm
     config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    at_decisions(run, {40: lambda: fill(small_disk), 65: (small_disk / "ballast").unlink})
+    at_decisions(run, {25: lambda: fill(small_disk), 50: (small_disk / "ballast").unlink})
     with pytest.warns(UserWarning) as warned:
         run.run()
     texts = [str(warning.message) for warning in warned]
-    for steps in (90, 120):
+    for steps in (60, 90):
         assert f"no checkpoint at {steps} env steps (No space left on device); training goes on." in texts
     assert results(run, run_dir) == straight(config)
     (run_dir / "summary.json").unlink()
-    assert make_run(config, run_dir, resume=True).env_steps == 140
+    assert make_run(config, run_dir, resume=True).env_steps == 110
 
 
 def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(
@@ -211,7 +211,7 @@ def test_a_run_that_dies_on_a_full_disk_goes_on_from_its_last_checkpoint(
     config = small_config(checkpoint_every=30)
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
-    at_decisions(run, {40: lambda: fill(small_disk), 55: kill})
+    at_decisions(run, {40: lambda: fill(small_disk), 53: kill})
     with pytest.warns(UserWarning, match="no checkpoint at 90 env steps"), pytest.raises(Killed):
         run.run()
     run.log.directory.close()
@@ -227,7 +227,7 @@ def test_a_run_whose_end_cannot_be_saved_is_not_finished(small_disk, straight, s
     run_dir = small_disk / "run"
     run = make_run(config, run_dir)
     at_decisions(run, {50: lambda: fill(small_disk)})
-    expected = r"^run_dir=.* made its 140 env steps, but the end could not be saved \(No space left on device\), so "
+    expected = r"^run_dir=.* made its 110 env steps, but the end could not be saved \(No space left on device\), so "
     with pytest.warns(UserWarning), pytest.raises(OSError, match=expected):
         run.run()
     assert not run.log.directory.finished
@@ -254,7 +254,7 @@ def test_a_run_whose_last_checkpoint_cannot_be_written_is_not_finished(tmp_path,
 def test_a_damaged_buffer_can_be_gone_on_with_on_request(tmp_path, finished, small_config, make_run):
     run_dir = shutil.copytree(finished, tmp_path / "run")
     (run_dir / "summary.json").unlink()
-    manifest = json.loads((run_dir / "checkpoints" / "resume" / f"{140:012d}" / "manifest.json").read_text())["replay"]
+    manifest = json.loads((run_dir / "checkpoints" / "resume" / f"{110:012d}" / "manifest.json").read_text())["replay"]
     oldest = run_dir / "checkpoints" / "replay" / manifest["rows"][0]["file"]
     data = bytearray(oldest.read_bytes())
     data[len(data) // 2] ^= 1
@@ -262,16 +262,16 @@ def test_a_damaged_buffer_can_be_gone_on_with_on_request(tmp_path, finished, sma
     advice = r" is not the file that was written: .*\. resume=weights goes on with the weights and what "
     with pytest.raises(CheckpointError, match=advice):
         make_run(small_config(), run_dir, resume=True)
-    config = small_config(resume="weights", total_env_steps=160)
-    with pytest.warns(UserWarning, match=r"140 with its weights and 45 of 70 rows of its buffer; .*damaged\.$"):
+    config = small_config(resume="weights", total_env_steps=130)
+    with pytest.warns(UserWarning, match=r"110 with its weights and 30 of 55 rows of its buffer; .*damaged\.$"):
         run = make_run(config, run_dir, resume=True)
     content = read_agent_file(run_dir / "checkpoints" / "last.pt")
     assert all(torch.equal(value, content["loss"][name]) for name, value in run.learner.agent.loss.state_dict().items())
-    assert (run.env_steps, len(run.learner.replay)) == (140, 45)
+    assert (run.env_steps, len(run.learner.replay)) == (110, 30)
     run.run()
-    assert (run.env_steps, len(run.learner.replay)) == (160, 55)
+    assert (run.env_steps, len(run.learner.replay)) == (130, 40)
     stored = run.learner.replay[:]
-    assert stored["collector", "traj_ids"][44] < stored["collector", "traj_ids"][45]  # a fresh episode
+    assert stored["collector", "traj_ids"][29] < stored["collector", "traj_ids"][30]  # a fresh episode
     run.log.directory.close()
     resumed = make_run(config, run_dir, resume=True)  # and whole again
     assert (stored == resumed.learner.replay[:]).all()
@@ -282,7 +282,7 @@ def test_too_little_of_a_buffer_is_refused(tmp_path, finished, small_config, mak
     for file in (run_dir / "checkpoints" / "replay").glob("rows*"):
         file.write_bytes(b"")
     with (
-        pytest.warns(UserWarning, match="and 0 of 70 rows"),
+        pytest.warns(UserWarning, match="and 0 of 55 rows"),
         pytest.raises(CheckpointError, match=r"^cannot resume: 0 rows of the buffer are left, fewer than the 24 "),
     ):
         make_run(small_config(resume="weights"), run_dir, resume=True)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from itertools import count
 from typing import Any
 
 import pytest
@@ -11,12 +10,7 @@ pytest.importorskip("dm_control")
 
 from torchrl_etdmpc.collectors import StepCollector  # noqa: E402
 from torchrl_etdmpc.runs import RunDirectory  # noqa: E402
-from torchrl_etdmpc.training import (  # noqa: E402
-    RunInterrupted,
-    read_agent_file,
-    read_run_config,
-    resumed_config,
-)
+from torchrl_etdmpc.training import RunInterrupted, read_run_config, resumed_config  # noqa: E402
 from torchrl_etdmpc.training.run_checkpoints import RandomState  # noqa: E402
 from torchrl_etdmpc.training.signals import WorkLeftError  # noqa: E402
 
@@ -67,7 +61,8 @@ def test_a_run_that_is_asked_to_stop_does_not_wait_for_the_end_of_an_evaluation(
     [
         {
             "num_envs": 3,
-            "total_env_steps": 200,
+            "total_env_steps": 170,
+            "optim": {"updates_per_decision": 1},
             "loss": {"value_replayed": 0.5, "value_expectile": 0.7},
             "model": {"normalize_observations": True},
         },
@@ -86,7 +81,7 @@ def test_every_kind_of_run_can_be_stopped_many_times(
 ):
     config = small_config(**changes)
     run = make_run(config, tmp_path)
-    for call in (9, 4, 3, 7, 1):
+    for call in (5, 20, 3):  # in the random phase, and twice while it learns
         stop_at(run, run.learner.collector, "act", call)
         with pytest.raises(RunInterrupted):
             run.run()
@@ -109,7 +104,7 @@ def test_a_run_that_was_killed_forgets_what_came_after_its_checkpoint(
 
     run = make_run(config, tmp_path)
     original = run.learner.collector.act
-    calls = iter([original] * 62 + [lambda *_: die()])
+    calls = iter([original] * 54 + [lambda *_: die()])
     run.learner.collector.act = lambda *args: next(calls)(*args)
     with pytest.raises(Killed):
         run.run()
@@ -147,15 +142,15 @@ def test_a_simulator_that_cannot_be_restored_does_not_begin_as_the_run_did(
 
 
 def test_a_longer_budget_goes_on_with_a_finished_run(tmp_path, small_config, make_run):
-    short = small_config(total_env_steps=100)
+    short = small_config(total_env_steps=80)
     run = make_run(short, tmp_path)
     run.run()
     stored = read_run_config(RunDirectory(tmp_path))
-    longer = resumed_config(stored, small_config(total_env_steps=140), ["total_env_steps"])
+    longer = resumed_config(stored, small_config(total_env_steps=120), ["total_env_steps"])
     resumed = make_run(longer, tmp_path, resume=True)
-    assert resumed.run()["env_steps"] == 140
-    assert read_run_config(RunDirectory(tmp_path)).total_env_steps == 140
-    assert len(resumed.learner.replay) == 70
+    assert resumed.run()["env_steps"] == 120
+    assert read_run_config(RunDirectory(tmp_path)).total_env_steps == 120
+    assert len(resumed.learner.replay) == 60
     again = make_run(longer, tmp_path, resume=True)
     assert (again.learner.replay[:] == resumed.learner.replay[:]).all()  # targets too
 
@@ -251,10 +246,14 @@ def test_a_run_goes_on_where_there_are_fewer_gpus(tmp_path, monkeypatch, small_c
     plain = GlobalRNGState.state_dict
     device = torch.cuda.get_rng_state() if torch.cuda.is_available() else torch.zeros(16, dtype=torch.uint8)
     monkeypatch.setattr(GlobalRNGState, "state_dict", lambda self: plain(self) | {"torch_cuda": 99 * [device]})
-    make_run(small_config(), tmp_path / "run").run()
+    run = make_run(small_config(), tmp_path / "run")
+    run.learner.step()
+    assert run.checkpoints.save()
+    run.log.directory.close()
     with pytest.warns(UserWarning, match=r"saved on a machine with 99 GPUs, here are \d+: it goes on with "):
-        resumed = make_run(small_config(total_env_steps=180), tmp_path / "run", resume=True)
-    assert resumed.run()["env_steps"] == 180
+        resumed = make_run(small_config(), tmp_path / "run", resume=True)
+    assert resumed.learner.step()
+    assert resumed.env_steps == 4
 
 
 def test_the_gpus_that_are_here_get_their_random_numbers_back(monkeypatch):
@@ -268,31 +267,3 @@ def test_the_gpus_that_are_here_get_their_random_numbers_back(monkeypatch):
         RandomState().load_state_dict(state | {"torch_cuda": [first, second]})
     assert restored == [[1], [1]]
     assert torch.equal(torch.rand(3), expected)
-
-
-def test_the_best_agent_is_the_uninterrupted_run_s(tmp_path, finished, small_config, make_run):
-    """Killed between the evaluation that wrote it and the next checkpoint, and its file lost."""
-    config = small_config(checkpoint_every=1000)
-    run = make_run(config, tmp_path)
-    calls = count(1)
-
-    def die(*_: Any) -> None:
-        if next(calls) == 40:
-            raise KeyboardInterrupt
-
-    act = run.learner.collector.act
-    run.learner.collector.act = lambda: (die(), act())[1]
-    with pytest.raises(KeyboardInterrupt):
-        run.run()
-    run.log.directory.close()
-    assert (tmp_path / "checkpoints" / "best.pt").exists()
-    run = make_run(config, tmp_path, resume=True)
-    assert run.env_steps == 0
-    run.run()
-    content = [read_agent_file(path / "checkpoints" / "best.pt") for path in (finished, tmp_path)]
-    assert content[0]["counters"]["updates"] == content[1]["counters"]["updates"]
-    for name, value in content[0]["loss"].items():
-        assert torch.equal(value, content[1]["loss"][name])
-    (tmp_path / "checkpoints" / "best.pt").unlink()
-    make_run(config, tmp_path, resume=True)
-    assert torch.equal(read_agent_file(tmp_path / "checkpoints" / "best.pt")["loss"][name], value)

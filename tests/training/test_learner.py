@@ -130,8 +130,10 @@ def test_a_row_counts_the_planned_decisions_whose_plan_fell_back(tmp_path, tiny_
             learner.step(updates=True)
         said = pytest.warns(UserWarning, match="^no plan since the last row had finite scores, so the pol")
         with said if plans == [2] else contextlib.nullcontext():
-            shares.append(learner.pop_row()["plan_fallbacks"])
+            row = learner.pop_row()
+        shares.append(row["plan_fallbacks"])
     assert shares == [3 / 8, 1, 0]
+    assert not [name for name in row if name.startswith("target")]  # nothing is reanalyzed
     assert ("plan", "fallback") not in learner.replay[:].keys(True, True)
 
 

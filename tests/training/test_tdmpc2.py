@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch.utils._pytree import tree_map_only
 
 pytest.importorskip("dm_control")
 
@@ -19,7 +16,6 @@ from torchrl_etdmpc.testing import random_slices  # noqa: E402
 from torchrl_etdmpc.training import (  # noqa: E402
     RunInterrupted,
     TrainConfig,
-    TrainingRun,
     build_agent,
     load_agent,
     save_agent,
@@ -54,40 +50,19 @@ def test_plans_that_no_term_reads_are_not_made_anew(tdmpc2_config):
         build_agent(tdmpc2_config(reanalyze={"every": 10}), 5, 1)
 
 
-def outcome(run: TrainingRun, run_dir: Path) -> dict[str, Any]:
-    """Everything that must not depend on interruptions."""
-    rows = {}
-    for name in ("train.csv", "eval.csv"):
-        with (run_dir / name).open(newline="") as file:
-            rows[name] = [{k: v for k, v in row.items() if k != "wall_time_s"} for row in csv.DictReader(file)]
-    agent = run.learner.agent
-    weights = {name: value.tolist() for name, value in agent.loss.state_dict().items()}
-    updater = tree_map_only(torch.Tensor, torch.Tensor.tolist, agent.updater.state_dict())
-    return {"weights": weights, "updater": updater, "random": torch.rand(3).tolist(), **rows}
-
-
-def test_a_run_that_was_killed_goes_on_as_if_nothing_had_happened(tmp_path, tdmpc2_config, make_run):
+def test_a_run_that_was_stopped_goes_on_as_if_nothing_had_happened(
+    tmp_path, tdmpc2_config, make_run, straight, results, stop_at
+):
     config = tdmpc2_config()
-    straight = make_run(config, tmp_path / "straight")
-    straight.run()
-    expected = outcome(straight, tmp_path / "straight")
-    run = make_run(config, tmp_path / "killed")
-    for owner, method, call in (("updater", "step", 4), ("updater", "step", 9), ("collector", "act", 12)):
-        part = run.learner.agent.updater if owner == "updater" else run.learner.collector
-        original, calls = getattr(part, method), [0]
-
-        def watched(*args: Any, original=original, calls=calls, call=call, run=run, **kwargs: Any) -> Any:
-            calls[0] += 1
-            run.stop.requested = run.stop.requested or calls[0] == call
-            return original(*args, **kwargs)
-
-        setattr(part, method, watched)
+    run = make_run(config, tmp_path)
+    for part, method, call in (("updater", "step", 4), ("updater", "step", 9), ("collector", "act", 12)):
+        stop_at(run, run.learner.collector if part == "collector" else run.learner.agent.updater, method, call)
         with pytest.raises(RunInterrupted):
             run.run()
         run.log.directory.close()
-        run = make_run(config, tmp_path / "killed", resume=True)
+        run = make_run(config, tmp_path, resume=True)
     run.run()
-    assert outcome(run, tmp_path / "killed") == expected
+    assert results(run, tmp_path) == straight(config)
     assert run.learner.agent.updater.updates == 7 + 2 * 50
 
 
