@@ -20,16 +20,6 @@ MEAN_Q = torch.tensor([0.2, 0.5, 0.9, -0.3], dtype=torch.float64)
 STD_Q = torch.tensor([2.0, 0.3, 0.1, 2.7], dtype=torch.float64)
 
 
-def test_kl_is_zero_for_equal_gaussians():
-    torch.testing.assert_close(gaussian_kl(MEAN_P, STD_P, MEAN_P, STD_P), torch.zeros(4, dtype=torch.float64))
-
-
-def test_kl_is_positive_where_either_mean_or_std_differs():
-    assert (gaussian_kl(MEAN_P, STD_P, MEAN_P + 0.01, STD_P) > 0).all()
-    assert (gaussian_kl(MEAN_P, STD_P, MEAN_P, 1.01 * STD_P) > 0).all()
-    assert (gaussian_kl(MEAN_P, STD_P, MEAN_P, 0.99 * STD_P) > 0).all()
-
-
 def test_kl_equals_torchs_in_both_directions_and_they_differ():
     p, q = Normal(MEAN_P, STD_P), Normal(MEAN_Q, STD_Q)
     forward = gaussian_kl(MEAN_P, STD_P, MEAN_Q, STD_Q)
@@ -45,20 +35,8 @@ def test_kl_forgives_a_narrow_first_argument_and_punishes_a_wide_one():
     assert gaussian_kl(zero, wide, zero, narrow) > 100
 
 
-def test_kl_does_not_change_when_both_gaussians_are_shifted_or_scaled_together():
-    kl = gaussian_kl(MEAN_P, STD_P, MEAN_Q, STD_Q)
-    torch.testing.assert_close(gaussian_kl(MEAN_P + 3, STD_P, MEAN_Q + 3, STD_Q), kl)
-    torch.testing.assert_close(gaussian_kl(5 * MEAN_P, 5 * STD_P, 5 * MEAN_Q, 5 * STD_Q), kl)
-
-
 def test_entropy_equals_torchs():
     torch.testing.assert_close(gaussian_entropy(STD_P.log()), Normal(MEAN_P, STD_P).entropy())
-
-
-def test_entropy_grows_by_one_nat_when_the_std_grows_e_fold():
-    torch.testing.assert_close(
-        gaussian_entropy(STD_P.log() + 1) - gaussian_entropy(STD_P.log()), torch.ones(4).double()
-    )
 
 
 def test_a_sample_without_noise_is_the_mean_and_noise_is_scaled_by_the_std():
@@ -80,21 +58,13 @@ def test_a_sample_passes_the_reparametrised_gradient_and_none_where_it_is_clippe
     torch.testing.assert_close(std.grad, torch.tensor([1.2, 0.0]))
 
 
-@pytest.mark.parametrize(("low", "high"), [(-3.0, 1.0), (-2.0, 1.0), (0.5, 0.6)])
-def test_log_std_reaches_both_bounds_and_never_leaves_them(low, high):
-    raw = torch.tensor([-1e30, -20.0, -1.0, 0.0, 1.0, 20.0, 1e30], dtype=torch.float64)
-    log_std = bounded_log_std(raw, low, high)
-    torch.testing.assert_close(log_std[[0, 1]], torch.full((2,), low, dtype=torch.float64))
-    torch.testing.assert_close(log_std[[-1, -2]], torch.full((2,), high, dtype=torch.float64))
-    assert log_std.min() >= low - 1e-12
-    assert log_std.max() <= high + 1e-12
-    assert (log_std.diff() >= 0).all()
-
-
-def test_log_std_is_the_formula_of_the_thesis():
-    # lo + (hi - lo) / 2 * (tanh(raw) + 1)
-    value = bounded_log_std(torch.tensor(0.7, dtype=torch.float64), -3.0, 1.0).item()
-    assert value == pytest.approx(-3 + 2 * (math.tanh(0.7) + 1), abs=1e-12)
+@pytest.mark.parametrize(("low", "high"), [(-3.0, 1.0), (0.5, 0.6)])
+def test_log_std_is_the_formula_of_the_thesis_and_never_leaves_its_bounds(low, high):
+    raw = [-1e30, -20.0, -1.0, 0.0, 0.7, 20.0, 1e30]
+    log_std = bounded_log_std(torch.tensor(raw, dtype=torch.float64), low, high)
+    expected = [low + (high - low) / 2 * (math.tanh(x) + 1) for x in raw]
+    assert log_std.tolist() == pytest.approx(expected, abs=1e-12)
+    assert (log_std.min(), log_std.max()) == pytest.approx((low, high), abs=1e-12)
 
 
 def test_the_log_slope_of_the_tanh_is_its_derivative_and_finite_where_it_is_saturated():

@@ -76,23 +76,13 @@ def tables(horizon: int) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     }
 
 
-def test_ensemble_mean_is_the_mean_over_all_pairs_of_heads():
-    returns = normal(5, 3, 4, 2)
-    torch.testing.assert_close(ensemble_mean(returns), returns.flatten(-2).mean(-1))
-
-
 @pytest.mark.parametrize(("heads", "values"), [(2, 1), (1, 2), (4, 2), (3, 5)])
-def test_ensemble_variance_is_eq_3_3_term_by_term(heads, values):
-    returns = normal(heads, values)
-    members = heads * values
-    mean = sum(returns[i, j] for i in range(heads) for j in range(values)) / members
-    expected = sum((returns[i, j] - mean) ** 2 for i in range(heads) for j in range(values)) / (members * (members - 1))
-    torch.testing.assert_close(ensemble_variance(returns), expected)
-
-
-def test_ensemble_variance_is_the_sample_variance_over_the_number_of_members():
-    returns = normal(5, 3, 4, 2)
-    torch.testing.assert_close(ensemble_variance(returns), returns.flatten(-2).var(-1, correction=1) / 8)
+def test_ensemble_mean_and_variance_are_those_of_all_pairs_of_heads(heads, values):
+    returns = normal(5, 3, heads, values)
+    members = returns.flatten(-2)
+    torch.testing.assert_close(ensemble_mean(returns), members.mean(-1))
+    variance = members.var(-1, correction=1) / (heads * values)  # of the mean (thesis Eq. 3.3)
+    torch.testing.assert_close(ensemble_variance(returns), variance)
 
 
 def test_ensemble_variance_of_one_member_or_of_agreeing_members_is_zero():
@@ -159,29 +149,6 @@ def test_the_weights_lie_in_the_simplex_and_attain_the_value(dtype, beta):
     torch.testing.assert_close(attained(weights, mean, std, beta), value.double(), rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("beta", [0.1, 1.0, 10.0])
-def test_no_single_depth_and_no_uniform_mixture_beats_the_adaptive_mixture(beta):
-    mean, std = 4 * normal(500, 6), 0.01 + uniform(500, 6, seed=1)
-    value, _ = adaptive_mixture(mean, std, beta)
-    assert (value.unsqueeze(-1) >= mean - beta * std - 1e-9).all()
-    equal = torch.full_like(mean, 1 / 6)
-    assert (value >= attained(equal, mean, std, beta) - 1e-9).all()
-
-
-def test_no_random_mixture_beats_the_adaptive_mixture():
-    mean, std = normal(20, 6), 0.01 + uniform(20, 6, seed=1)
-    value, _ = adaptive_mixture(mean, std, 2.0)
-    others = normal(1000, 20, 6, seed=2).mul(2).softmax(-1)
-    assert (value >= attained(others, mean, std, 2.0) - 1e-9).all()
-
-
-def test_with_one_depth_the_value_is_its_lower_confidence_bound():
-    mean, std = normal(50, 1), uniform(50, 1) + 0.1
-    value, weights = adaptive_mixture(mean, std, 3.0)
-    torch.testing.assert_close(value, (mean - 3 * std).squeeze(-1))
-    assert torch.equal(weights, torch.ones_like(mean))
-
-
 def test_equally_good_depths_are_weighted_by_their_inverse_variance():
     std = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
     value, weights = adaptive_mixture(torch.full((3,), 5.0, dtype=torch.float64), std, 2.0)
@@ -224,13 +191,6 @@ def test_a_growing_beta_never_raises_the_value_and_ends_at_the_smallest_variance
     torch.testing.assert_close(weights, precision / precision.sum(), rtol=1e-4, atol=0)
 
 
-def test_a_depth_far_below_the_others_gets_no_weight():
-    mean = torch.tensor([1.0, -100.0, 1.1])
-    _, weights = adaptive_mixture(mean, torch.tensor([0.5, 0.5, 0.5]), 1.0)
-    assert weights[1] == 0
-    assert (weights[[0, 2]] > 0).all()
-
-
 @pytest.mark.parametrize("offset", [1e4, -1e4])
 @pytest.mark.parametrize("beta", [0.1, 1.0, 10.0])
 def test_a_large_common_offset_costs_no_accuracy_in_float32(offset, beta):
@@ -243,36 +203,14 @@ def test_a_large_common_offset_costs_no_accuracy_in_float32(offset, beta):
     torch.testing.assert_close(weights.double(), expected_weights, rtol=0, atol=2e-4)
 
 
-def test_a_certain_depth_far_below_an_uncertain_one_gets_the_weight_in_float32():
-    # Its share of the gap to the optimum is 1e-5, lost in float32 if the sums were relative to the other depth.
-    mean, std = torch.tensor([0.0, 1000.0]), torch.tensor([0.0, 200.0])
-    value, weights = adaptive_mixture(mean, std, 10.0)
-    assert weights[0] > 0.999
-    torch.testing.assert_close(value.double(), attained(weights, mean, std, 10.0), rtol=0, atol=1e-4)
-
-
-def test_a_shift_of_all_depths_shifts_the_value_and_keeps_the_weights():
+@pytest.mark.parametrize(
+    ("shift", "scale", "beta"), [(7.0, 1.0, 2.0), (0.0, 0.01, 2.0), (0.0, 100.0, 2.0), (0.0, 1.0, 0.5), (7.0, 3.0, 8.0)]
+)
+def test_the_value_follows_the_units_of_returns_and_only_beta_times_std_matters(shift, scale, beta):
     mean, std = normal(50, 6), 0.1 + uniform(50, 6)
     value, weights = adaptive_mixture(mean, std, 2.0)
-    shifted_value, shifted_weights = adaptive_mixture(mean + 7, std, 2.0)
-    torch.testing.assert_close(shifted_value, value + 7)
-    torch.testing.assert_close(shifted_weights, weights)
-
-
-@pytest.mark.parametrize("scale", [0.01, 3.0, 100.0])
-def test_the_value_scales_with_the_units_of_return_and_the_weights_do_not(scale):
-    mean, std = normal(50, 6), 0.1 + uniform(50, 6)
-    value, weights = adaptive_mixture(mean, std, 2.0)
-    scaled_value, scaled_weights = adaptive_mixture(scale * mean, scale * std, 2.0)
-    torch.testing.assert_close(scaled_value, scale * value)
-    torch.testing.assert_close(scaled_weights, weights)
-
-
-def test_only_the_product_of_beta_and_std_matters():
-    mean, std = normal(50, 6), 0.1 + uniform(50, 6)
-    value, weights = adaptive_mixture(mean, std, 2.0)
-    other_value, other_weights = adaptive_mixture(mean, 4 * std, 0.5)
-    torch.testing.assert_close(other_value, value)
+    other_value, other_weights = adaptive_mixture(scale * mean + shift, scale * std * 2.0 / beta, beta)
+    torch.testing.assert_close(other_value, scale * value + shift)
     torch.testing.assert_close(other_weights, weights)
 
 
@@ -284,14 +222,6 @@ def test_permuting_the_depths_permutes_the_weights_and_keeps_the_value():
     permuted_value, permuted_weights = adaptive_mixture(mean[:, permutation], std[:, permutation], 2.0)
     torch.testing.assert_close(permuted_value, value)
     torch.testing.assert_close(permuted_weights, weights[:, permutation])
-
-
-def test_float32_and_float64_agree():
-    mean, std = 5 * normal(200, 6), 0.05 + uniform(200, 6, seed=1)
-    value, weights = adaptive_mixture(mean, std, 1.0)
-    single_value, single_weights = adaptive_mixture(mean.float(), std.float(), 1.0)
-    torch.testing.assert_close(single_value.double(), value, rtol=0, atol=1e-5)
-    torch.testing.assert_close(single_weights.double(), weights, rtol=0, atol=1e-4)
 
 
 def test_any_leading_batch_gives_the_result_of_its_parts_and_inputs_are_left_alone():
@@ -306,16 +236,6 @@ def test_any_leading_batch_gives_the_result_of_its_parts_and_inputs_are_left_alo
             torch.testing.assert_close(single_weights, weights[i, j])
     assert torch.equal(mean, before[0])
     assert torch.equal(std, before[1])
-
-
-def test_the_solver_needs_no_gradient():
-    mean, std = normal(5, 6), 0.1 + uniform(5, 6)
-    with torch.inference_mode():
-        value, weights = adaptive_mixture(mean, std, 1.0)
-    expected_value, expected_weights = adaptive_mixture(mean, std, 1.0)
-    assert torch.equal(value, expected_value)
-    assert torch.equal(weights, expected_weights)
-    assert not expected_value.requires_grad
 
 
 def test_the_weights_are_the_derivative_of_the_value_by_the_depths_means():
@@ -374,4 +294,5 @@ def test_what_is_left_of_a_depth_that_is_all_but_given_up_counts_in_float32(cert
     mean[certain] = std[certain] = 0.0
     value, weights = adaptive_mixture(mean, std, 10.0)
     assert value.item() == pytest.approx(-10 * SIGMA_FLOOR * math.sqrt(1 - 0.5**2), rel=1e-3)
-    assert weights[1 - certain].item() > 0
+    assert 0 < weights[1 - certain].item() < 1e-3
+    torch.testing.assert_close(value.double(), attained(weights, mean, std, 10.0), rtol=0, atol=1e-4)

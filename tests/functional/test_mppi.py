@@ -27,23 +27,12 @@ def labelled(num_candidates: int, horizon: int = 2, action_dim: int = 1) -> torc
     return (torch.arange(num_candidates) + 1.0).view(-1, 1, 1).expand(-1, horizon, action_dim)
 
 
-def test_shift_plan_drops_the_first_action_and_appends_zeros():
-    mean = normal(3, 5, 4, 2)
-    shifted = shift_plan(mean)
-    assert torch.equal(shifted[..., :-1, :], mean[..., 1:, :])
-    assert shifted[..., -1, :].count_nonzero() == 0
-
-
-def test_shifting_a_plan_by_its_length_empties_it():
-    mean = normal(3, 2)
-    assert shift_plan(mean[:1]).count_nonzero() == 0
-    assert shift_plan(shift_plan(shift_plan(mean))).count_nonzero() == 0
-
-
-def test_shift_plan_leaves_its_input_alone():
-    mean = normal(3, 2)
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_shift_plan_drops_the_first_action_appends_zeros_and_leaves_its_input_alone(horizon):
+    mean = normal(3, 5, horizon, 2)
     before = mean.clone()
-    shift_plan(mean).add_(1)
+    shifted = shift_plan(mean)
+    assert torch.equal(shifted, torch.cat([before[..., 1:, :], torch.zeros(3, 5, 1, 2)], -2))
     assert torch.equal(mean, before)
 
 
@@ -66,21 +55,6 @@ def test_elites_are_the_highest_scores_in_descending_order_with_their_own_action
     assert elites.scores.tolist() == pytest.approx([2.0, 1.0, 0.3])
     assert elites.actions[:, 0, 0].tolist() == [3.0, 4.0, 1.0]
     assert elites.actions.shape == (3, 2, 1)
-
-
-def test_selecting_every_candidate_sorts_them():
-    scores = normal(20)
-    elites = select_elites(labelled(20), scores, 20)
-    assert torch.equal(elites.scores, scores.sort(descending=True).values)
-    assert torch.equal(elites.actions[:, 0, 0], scores.argsort(descending=True) + 1.0)
-
-
-def test_the_order_of_the_candidates_does_not_matter():
-    scores, actions, permutation = normal(20), normal(20, 3, 2, seed=1), normal(20, seed=2).argsort()
-    elites = select_elites(actions, scores, 5)
-    permuted = select_elites(actions[permutation], scores[permutation], 5)
-    assert torch.equal(elites.actions, permuted.actions)
-    assert torch.equal(elites.scores, permuted.scores)
 
 
 @pytest.mark.parametrize("bad", NON_FINITE)
@@ -149,21 +123,8 @@ def test_weights_are_a_softmax_of_the_scores_times_the_inverse_temperature():
     torch.testing.assert_close(elite_weights(scores, 0.5), expected / expected.sum(-1, keepdim=True))
 
 
-@pytest.mark.parametrize("inverse_temperature", [0.5, 20.0])
-def test_weights_are_uniform_when_indifferent(inverse_temperature):
-    torch.testing.assert_close(elite_weights(torch.full((4,), 123.0), inverse_temperature), torch.full((4,), 0.25))
-
-
-def test_weights_are_uniform_at_inverse_temperature_zero():
-    torch.testing.assert_close(elite_weights(normal(3, 8), 0.0), torch.full((3, 8), 1 / 8))
-
-
 def test_an_empty_place_has_weight_zero_at_inverse_temperature_zero_too():
     assert elite_weights(torch.tensor([3.0, 1.0, -torch.inf]), 0.0).tolist() == [0.5, 0.5, 0.0]
-
-
-def test_a_great_inverse_temperature_chooses_the_best():
-    assert elite_weights(torch.tensor([1.0, 2.0, 1.5]), 1e4).tolist() == [0.0, 1.0, 0.0]
 
 
 @pytest.mark.parametrize("offset", [1e6, -1e6])
@@ -172,17 +133,6 @@ def test_large_scores_give_the_weights_of_their_differences(offset):
     weights = elite_weights(scores + offset, 0.5)
     assert weights.isfinite().all()
     torch.testing.assert_close(weights, elite_weights(scores, 0.5))
-
-
-def test_scores_that_are_far_apart_do_not_overflow():
-    assert elite_weights(torch.tensor([1e6, 0.0, -1e6]), 0.5).tolist() == [1.0, 0.0, 0.0]
-
-
-def test_fit_gaussian_is_the_elite_average_when_indifferent():
-    actions = normal(3, 8, 4, 2)
-    plan = fit_gaussian(actions, torch.full((3, 8), 1 / 8), std_min=0.0, std_max=10.0)
-    torch.testing.assert_close(plan.mean, actions.mean(1))
-    torch.testing.assert_close(plan.std, actions.std(1, correction=0))
 
 
 def test_fit_gaussian_is_the_weighted_mean_and_standard_deviation():
@@ -203,16 +153,6 @@ def test_the_std_is_clipped_at_both_ends():
     actions = torch.tensor([[-1.0, 0.3], [1.0, 0.3]]).view(2, 1, 2)
     plan = fit_gaussian(actions, torch.tensor([0.5, 0.5]), std_min=0.05, std_max=0.7)
     torch.testing.assert_close(plan.std, torch.tensor([[0.7, 0.05]]))
-
-
-def test_a_permutation_of_the_elites_does_not_change_the_fit():
-    actions, scores = normal(8, 3, 2), normal(8, seed=1)
-    permutation = torch.tensor([7, 2, 5, 0, 1, 6, 3, 4])
-    plan = fit_gaussian(actions, elite_weights(scores, 0.5), std_min=0.05, std_max=2.0)
-    weights = elite_weights(scores[permutation], 0.5)
-    permuted = fit_gaussian(actions[permutation], weights, std_min=0.05, std_max=2.0)
-    torch.testing.assert_close(permuted.mean, plan.mean)
-    torch.testing.assert_close(permuted.std, plan.std)
 
 
 def test_the_fit_of_a_batch_is_the_fit_of_its_parts():

@@ -19,10 +19,6 @@ def test_with_rate_one_the_scale_is_the_spread_between_the_5th_and_the_95th_perc
     assert scale.item() == pytest.approx(max(spread_of(batch), 1.0), rel=1e-12)
 
 
-def test_with_rate_zero_the_scale_stays():
-    assert updated_scale(torch.tensor(7.0), torch.linspace(0, 1000, 11), tau=0.0) == 7
-
-
 def test_the_scale_is_an_exponential_moving_average():
     batch = torch.linspace(0, 100, 101, dtype=torch.float64)  # spread 90
     scale = torch.tensor(2.0, dtype=torch.float64)
@@ -33,19 +29,6 @@ def test_the_scale_is_an_exponential_moving_average():
         assert scale.item() == pytest.approx(expected, rel=1e-12)
 
 
-def test_the_scale_approaches_a_constant_spread():
-    batch = torch.linspace(0, 100, 101)
-    scale = torch.tensor(1.0)
-    for _ in range(200):
-        scale = updated_scale(scale, batch, tau=0.1)
-    assert scale.item() == pytest.approx(90, rel=1e-4)
-
-
-def test_the_scale_is_never_below_one():
-    assert updated_scale(torch.tensor(1.0), torch.zeros(10), tau=1.0) == 1
-    assert updated_scale(torch.tensor(1.5), torch.full((10,), 42.0), tau=1.0) == 1
-
-
 def test_a_batch_of_little_spread_counts_as_a_spread_of_one():
     scale = torch.tensor(1.0, dtype=torch.float64)
     expected = 1.0
@@ -54,13 +37,6 @@ def test_a_batch_of_little_spread_counts_as_a_spread_of_one():
         expected = 0.9 * expected + 0.1 * max(spread, 1.0)
         assert scale.item() == pytest.approx(expected, rel=1e-12)
     assert scale > 1.5  # its average; 1.2 is that of the spreads themselves
-
-
-def test_the_extreme_twentieths_of_the_batch_have_no_influence():
-    batch = torch.linspace(0, 100, 101)
-    wild = batch.clone()
-    wild[0], wild[-1] = -1e6, 1e6
-    assert updated_scale(torch.tensor(1.0), wild, 0.5) == updated_scale(torch.tensor(1.0), batch, 0.5)
 
 
 def test_the_scale_depends_on_neither_the_batchs_offset_nor_its_shape_nor_its_order():

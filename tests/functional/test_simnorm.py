@@ -11,15 +11,6 @@ def normal(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("group_size", [1, 4, 8, 32])
-def test_every_group_sums_to_one_and_is_positive(group_size):
-    groups = 32 // group_size
-    out = simnorm(3 * normal(5, 32), group_size)
-    for group in range(groups):
-        torch.testing.assert_close(out[:, group::groups].sum(-1), torch.ones(5, dtype=torch.float64))
-    assert (out > 0).all()
-
-
-@pytest.mark.parametrize("group_size", [4, 8])
 def test_simnorm_is_a_softmax_over_each_strided_group(group_size):
     x = normal(5, 32)
     groups = 32 // group_size
@@ -35,18 +26,6 @@ def test_simnorm_is_td_mpc2s_adjacent_groups_up_to_a_fixed_permutation():
     permutation = torch.arange(32).view(8, 4).T.flatten()
     adjacent = x[:, permutation].view(5, 4, 8).softmax(-1).view(5, 32)
     torch.testing.assert_close(simnorm(x, 8)[:, permutation], adjacent)
-
-
-def test_channels_of_other_groups_have_no_influence():
-    x = normal(32)
-    jacobian = torch.autograd.functional.jacobian(simnorm, x)
-    same_group = torch.arange(32) % 4
-    assert torch.equal(jacobian != 0, same_group.unsqueeze(0) == same_group.unsqueeze(1))
-
-
-def test_a_constant_added_to_all_channels_changes_nothing():
-    x = normal(32)
-    torch.testing.assert_close(simnorm(x + 1000), simnorm(x))
 
 
 def test_large_inputs_stay_finite_and_become_one_hot():

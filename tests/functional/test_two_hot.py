@@ -27,11 +27,6 @@ def test_symexp_inverts_symlog(x):
     torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-12, atol=1e-12)
 
 
-def test_symlog_inverts_symexp():
-    y = torch.linspace(-10, 10, 401, dtype=torch.float64)
-    torch.testing.assert_close(symlog(symexp(y)), y, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("function", [symlog, symexp])
 def test_symlog_and_symexp_are_odd_and_keep_the_sign(function):
     x = torch.linspace(-9, 9, 181)
@@ -53,25 +48,6 @@ def test_two_hot_weights_sum_to_one_and_lie_between_zero_and_one():
     assert weights.max() <= 1
 
 
-def test_two_hot_mass_lies_in_the_two_neighbouring_bins_only():
-    weights = two_hot_encode(SCALARS, BINS)
-    lower = ((symlog(SCALARS) + 10) / 0.2).floor().long().clamp(0, 99)
-    neighbours = weights.gather(-1, torch.stack([lower, lower + 1], dim=-1)).sum(-1)
-    torch.testing.assert_close(neighbours, weights.sum(-1), rtol=0, atol=2e-5)
-    assert (weights > 0).sum(-1).max() == 2
-
-
-@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 0.75])
-def test_two_hot_interpolates_linearly_in_symlog_space(fraction):
-    x = symexp(BINS64[60] + fraction * (BINS64[61] - BINS64[60]))
-    weights = two_hot_encode(x, BINS64)
-    torch.testing.assert_close(weights[60:62], torch.tensor([1 - fraction, fraction], dtype=torch.float64))
-
-
-def test_two_hot_of_a_bin_centre_is_one_hot():
-    torch.testing.assert_close(two_hot_encode(symexp(BINS64), BINS64), torch.eye(101, dtype=torch.float64))
-
-
 @pytest.mark.parametrize("x", [1e5, 1e30, math.inf, math.expm1(10) * 1.0001])
 def test_a_value_beyond_an_end_puts_all_its_mass_in_that_end_and_none_in_the_other(x):
     above, below = two_hot_encode(torch.tensor([x, -x]), BINS)
@@ -79,15 +55,6 @@ def test_a_value_beyond_an_end_puts_all_its_mass_in_that_end_and_none_in_the_oth
     assert above[:-1].count_nonzero() == 0
     assert below[0] == 1
     assert below[1:].count_nonzero() == 0
-
-
-@pytest.mark.parametrize("target", [1e5, -1e5])
-def test_the_loss_of_a_value_beyond_an_end_sends_no_gradient_to_the_opposite_bin_beyond_the_softmax(target):
-    logits = torch.zeros(101, requires_grad=True)
-    two_hot_cross_entropy(logits, torch.tensor(target), BINS).backward()
-    end, opposite = (-1, 0) if target > 0 else (0, -1)
-    torch.testing.assert_close(logits.grad[end].item(), 1 / 101 - 1)
-    torch.testing.assert_close(logits.grad[opposite].item(), 1 / 101)
 
 
 def test_decoding_an_encoded_value_returns_it_over_the_whole_range():
@@ -106,10 +73,6 @@ def test_decoding_averages_in_symlog_space_and_not_over_the_scalars():
 def test_decoding_ignores_a_constant_added_to_the_logits():
     logits = torch.randn(5, 101, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     torch.testing.assert_close(two_hot_decode(logits + 1000, BINS64), two_hot_decode(logits, BINS64))
-
-
-def test_a_uniform_distribution_decodes_to_zero():
-    assert two_hot_decode(torch.zeros(101), BINS).abs() < 1e-6
 
 
 @pytest.mark.parametrize(("low", "high", "num_bins"), [(-10, 10, 101), (-20, 20, 255), (-1, 3, 5), (0, 1, 2)])
@@ -143,11 +106,6 @@ def test_cross_entropy_is_minimal_at_the_targets_own_distribution():
     generator = torch.Generator().manual_seed(0)
     others = own.clamp_min(1e-30).log() + torch.randn(100, 101, generator=generator, dtype=torch.float64)
     assert (two_hot_cross_entropy(others, target, BINS64) > least).all()
-
-
-def test_cross_entropy_of_uniform_logits_is_the_logarithm_of_the_number_of_bins():
-    loss = two_hot_cross_entropy(torch.zeros(3, 101), torch.tensor([-5.0, 0.0, 1e9]), BINS)
-    torch.testing.assert_close(loss, torch.full((3,), math.log(101)), rtol=0, atol=1e-4)
 
 
 def test_the_gradient_of_the_cross_entropy_is_softmax_minus_target():

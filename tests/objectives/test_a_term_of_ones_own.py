@@ -204,24 +204,6 @@ def test_the_gradient_goes_where_the_term_sends_it(make_loss, world_model, slice
     assert trained == {"policy"}
 
 
-# tensordict reads a switch that torch deprecates
-@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
-def test_the_term_is_part_of_the_one_compiled_graph(make_loss, make_world_model, slices, gradients):
-    world_model = make_world_model(termination=True, dropout=0.0)
-    loss = make_loss("whole", world_model, extra_terms=[Term("full_throttle", full_throttle, 2.0)])
-    torch.compiler.reset()
-    compiled = torch.compile(loss.evaluate, fullgraph=True, backend="eager")
-    inputs = loss.slices(slices), loss.targets()
-    torch.manual_seed(0)
-    expected = loss.evaluate(*inputs)
-    torch.manual_seed(0)
-    actual = compiled(*inputs)
-    assert actual.keys() == expected.keys()
-    torch.testing.assert_close(actual["loss_full_throttle"], expected["loss_full_throttle"])
-    ours, theirs = (gradients(out["loss_full_throttle"], world_model) for out in (actual, expected))
-    torch.testing.assert_close(ours["policy"], theirs["policy"])
-
-
 def test_a_copied_loss_calls_the_term_with_its_own_world_model(make_loss, world_model, slices):
     def bias(world_model, slices, rollout):
         return world_model.dynamics.output.bias.sum() + torch.zeros_like(slices.reward)

@@ -59,4 +59,7 @@ def test_without_other_processes_the_policy_has_no_gradient_while_distillation_i
 
 if __name__ == "__main__":
     store, processes = Path(sys.argv[1]), int(sys.argv[2])
-    mp.spawn(train, (processes, store), nprocs=processes)
+    if processes == 1:
+        train(0, 1, store)
+    else:
+        mp.spawn(train, (processes, store), nprocs=processes)

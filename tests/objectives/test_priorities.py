@@ -36,12 +36,6 @@ def test_the_losses_are_weighted_by_slice(make_loss, kind, world_model, slices, 
     assert all(torch.equal(out["mean"][key], plain[key]) for key in metrics)
 
 
-def test_equal_weights_change_nothing(loss, slices, run_seeded, assert_same_output):
-    expected = run_seeded(loss.eval(), slices)
-    slices["priority_weight"] = torch.full((4, 3), 0.3)
-    assert_same_output(run_seeded(loss, slices), expected)
-
-
 def test_the_weight_of_a_slice_is_that_of_the_row_that_was_drawn(loss, slices, run_seeded, assert_same_output):
     expected = run_seeded(loss.eval(), weighted(slices))
     slices["priority_weight"][:, 1:] = torch.rand(4, 2)  # of rows that came along

@@ -51,8 +51,7 @@ def test_entry_b_k_of_an_unreduced_term_belongs_to_slice_b(make_loss, world_mode
         assert not changed[[0, 1, 3]].any()
 
 
-@pytest.mark.parametrize("mask_key", [("collector", "mask"), "shifted_valid"])
-@pytest.mark.parametrize("trailing", [(), (1,)])
+@pytest.mark.parametrize(("mask_key", "trailing"), [(("collector", "mask"), ()), ("shifted_valid", (1,))])
 def test_masked_steps_do_not_count(make_loss, world_model, kind, slices, run_seeded, mask_key, trailing, terms_of):
     mask = torch.arange(3) < torch.tensor([[3], [1], [0], [2]])
     loss = make_loss(kind, world_model, reduction="none").eval()
@@ -72,13 +71,12 @@ def test_masked_steps_do_not_count(make_loss, world_model, kind, slices, run_see
     assert all(torch.equal(again[key], unmasked[key]) for key in unmasked.keys())
 
 
-@pytest.mark.parametrize("mask_key", [("collector", "mask"), "shifted_valid"])
 def test_a_step_behind_a_masked_one_does_not_count_since_its_rollout_goes_through_it(
-    loss, slices, run_seeded, assert_same_output, mask_key
+    loss, slices, run_seeded, assert_same_output
 ):
-    slices[mask_key] = torch.tensor([[1, 1, 1], [1, 0, 1], [0, 1, 1], [0, 0, 1]]).bool()
+    slices["collector", "mask"] = torch.tensor([[1, 1, 1], [1, 0, 1], [0, 1, 1], [0, 0, 1]]).bool()
     with_gaps = run_seeded(loss.eval(), slices)
-    slices[mask_key] = torch.tensor([[1, 1, 1], [1, 0, 0], [0, 0, 0], [0, 0, 0]]).bool()
+    slices["collector", "mask"] = torch.tensor([[1, 1, 1], [1, 0, 0], [0, 0, 0], [0, 0, 0]]).bool()
     assert_same_output(with_gaps, run_seeded(loss, slices), rtol=0, atol=0)
 
 
@@ -101,7 +99,7 @@ def _pad(slices, fill):
     return padded
 
 
-@pytest.mark.parametrize("fill", [0.0, 30.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("fill", [0.0, float("nan"), float("inf")])
 def test_padded_steps_influence_neither_terms_nor_metrics_nor_gradients_nor_the_running_scale(
     make_loss, world_model, kind, slices, run_seeded, gradients, assert_same_output, total, fill
 ):
@@ -158,12 +156,6 @@ def test_a_batch_of_padding_alone_is_a_loss_of_zero_and_moves_nothing(make_loss,
         assert loss.kl_scale == 1
 
 
-def test_a_mask_of_ones_changes_nothing(loss, slices, run_seeded, assert_same_output):
-    expected = run_seeded(loss.eval(), slices)
-    slices["collector", "mask"] = torch.ones(4, 3, dtype=torch.bool)
-    assert_same_output(run_seeded(loss, slices), expected)
-
-
 def test_an_update_reads_the_mask_too(make_loss, make_world_model, slices):
     loss = make_loss("whole", make_world_model())
     updaters = [Updater(copy.deepcopy(loss)) for _ in range(2)]
@@ -173,15 +165,6 @@ def test_an_update_reads_the_mask_too(make_loss, make_world_model, slices):
         assert all(value.isfinite() for value in out.values())
     for ours, theirs in zip(*(updater.loss.parameters() for updater in updaters), strict=True):
         assert torch.equal(ours, theirs)
-
-
-def test_a_compiled_loss_reads_the_mask_in_one_graph(make_loss, world_model, slices):
-    loss = make_loss("whole", world_model)
-    inputs = loss.slices(_pad(slices, float("nan"))), loss.targets()
-    expected, scale = loss.eval().evaluate(*inputs), loss.train().kl_scale.clone()
-    assert torch.compile(loss.evaluate, fullgraph=True, backend="eager")(*inputs)["loss_policy"].isfinite()
-    assert loss.kl_scale.isfinite() and loss.kl_scale != scale
-    assert expected["loss_reward"].isfinite()
 
 
 def test_what_terminates_in_the_padding_is_not_refused(make_loss, make_world_model, slices):

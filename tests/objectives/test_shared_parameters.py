@@ -40,12 +40,14 @@ def test_reset_parameters_recursive_draws_new_weights_for_the_networks_that_are_
         assert first.any() and not torch.equal(first, second)
 
 
-def test_a_reset_of_the_whole_starts_the_count_of_updates_anew(make_loss):
+def test_a_reset_begins_the_running_scale_anew_and_one_of_the_whole_the_count_of_updates(make_loss):
     for kind, version in (("whole", 0), ("policy", 5)):
         loss = make_loss(kind)
         loss.world_model.version.fill_(5)
+        loss.kl_scale.fill_(50)
         loss.reset_parameters_recursive()
         assert loss.world_model.version == version
+        assert loss.kl_scale == 1
 
 
 def test_the_parameters_are_the_trained_networks_own_and_targets_add_none(loss, kind, world_model, networks, owned):

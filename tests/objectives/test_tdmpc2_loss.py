@@ -361,11 +361,13 @@ def test_the_policy_term_can_be_left_out(batch):
     assert "loss_policy" in evaluate(loss, batch)
 
 
-def test_new_weights_are_made_by_no_update(batch):
+def test_a_reset_begins_the_count_of_updates_the_targets_and_the_running_scale_anew():
     loss = make_loss()
     loss.world_model.version.fill_(7)
+    loss.q_scale.fill_(50)
     loss.reset_parameters_recursive()
     assert loss.world_model.version == 0
+    assert loss.q_scale == 1
     torch.testing.assert_close(loss.target_value_params.data, loss.value_params.data)
 
 
@@ -374,13 +376,6 @@ def test_every_option_arrives():
     options = coefs | {"policy_coef": 6.0, "entropy_coef": 0.5, "scale_tau": 0.25, "rho": 0.75, "reduction": "sum"}
     loss = make_loss(make_model(termination=True), **options)
     assert {name: getattr(loss, name) for name in options} == options
-
-
-def test_drawing_new_weights_begins_the_running_scale_anew():
-    loss = make_loss()
-    loss.q_scale.fill_(50)
-    loss.reset_parameters_recursive()
-    assert loss.q_scale == 1
 
 
 @pytest.mark.parametrize("cls", [EfficientTDMPCLoss, EfficientTDMPCValueLoss])

@@ -2,32 +2,20 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torchrl.objectives import SoftUpdate
 
-from torchrl_etdmpc import (
-    EfficientTDMPCLoss,
-    EfficientTDMPCModelLoss,
-    EfficientTDMPCPolicyLoss,
-    EfficientTDMPCValueLoss,
-)
 from torchrl_etdmpc.testing import random_slices
 
-_LOSSES = {
-    "whole": lambda *args, **options: EfficientTDMPCLoss(*args, discount=0.9, **options),
-    "model": EfficientTDMPCModelLoss,
-    "value": lambda *args, **options: EfficientTDMPCValueLoss(*args, discount=0.9, **options),
-}
+bootstrapping = pytest.mark.parametrize("kind", ["whole", "model", "value"])
 
 
-def make(kind, world_model, **options):
-    loss = _LOSSES[kind](world_model, **options)
-    if kind != "model":
-        SoftUpdate(loss, tau=0.01)
-    return loss
+@pytest.fixture
+def make(make_loss):
+    """Builds a loss that accepts no end which its model cannot predict, unless told otherwise."""
+    return lambda *args, **options: make_loss(*args, **{"ignore_termination": False, **options})
 
 
-@pytest.mark.parametrize("kind", _LOSSES)
-def test_a_row_that_terminates_is_refused_with_both_remedies(make_world_model, kind):
+@bootstrapping
+def test_a_row_that_terminates_is_refused_with_both_remedies(make, make_world_model, kind):
     loss = make(kind, make_world_model())
     terminated = random_slices(5, 3, terminated=True)
     with pytest.raises(
@@ -45,16 +33,16 @@ def test_a_row_that_terminates_is_refused_with_both_remedies(make_world_model, k
     assert loss(terminated.exclude(("next", "terminated"))).keys()  # and nobody says so
 
 
-@pytest.mark.parametrize("kind", _LOSSES)
+@bootstrapping
 @pytest.mark.parametrize("remedy", ["termination head", "ignored"])
-def test_either_remedy_accepts_it(make_world_model, kind, remedy):
+def test_either_remedy_accepts_it(make, make_world_model, kind, remedy):
     options = {"ignore_termination": True} if remedy == "ignored" else {}
     loss = make(kind, make_world_model(termination=remedy == "termination head"), **options)
     out = loss(random_slices(5, 3, terminated=True))
     assert ("loss_termination" in out.keys()) == (remedy == "termination head" and kind != "value")
 
 
-def test_the_flag_is_read_under_its_own_name(make_world_model):
+def test_the_flag_is_read_under_its_own_name(make, make_world_model):
     loss = make("whole", make_world_model())
     loss.set_keys(terminated="over")
     terminated = random_slices(5, 3, terminated=True)
@@ -63,12 +51,11 @@ def test_the_flag_is_read_under_its_own_name(make_world_model):
         loss(terminated.rename_key_(("next", "terminated"), ("next", "over")))
 
 
-def test_the_policy_does_not_bootstrap_and_does_not_ask(make_world_model):
-    loss = EfficientTDMPCPolicyLoss(make_world_model())
-    assert loss(random_slices(5, 3, terminated=True))["loss_policy"].isfinite()
+def test_the_policy_does_not_bootstrap_and_does_not_ask(make_loss):
+    assert make_loss("policy")(random_slices(5, 3, terminated=True))["loss_policy"].isfinite()
 
 
-def test_flags_without_a_dimension_of_their_own_are_read_step_by_step(make_world_model):
+def test_flags_without_a_dimension_of_their_own_are_read_step_by_step(make, make_world_model):
     loss, batch = make("whole", make_world_model()), random_slices(5, 3, num_slices=4, slice_len=1)
     flags = torch.tensor([[True], [False], [False], [False]])
     batch["next", "terminated"] = flags
@@ -80,7 +67,7 @@ def test_flags_without_a_dimension_of_their_own_are_read_step_by_step(make_world
 
 
 @pytest.mark.parametrize("reason", ["traced", "on a device"])
-def test_nothing_waits_for_the_flag_where_it_would_cost(make_world_model, monkeypatch, reason):
+def test_nothing_waits_for_the_flag_where_it_would_cost(make, make_world_model, monkeypatch, reason):
     loss, terminated = make("whole", make_world_model()), random_slices(5, 3, terminated=True)
     if reason == "traced":
         monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
