@@ -146,14 +146,15 @@ def test_candidates_are_scored_in_another_dtype(make_planner, states):
     observation, noise = states(2), plain.draw_noise(2)
     expected = plain.plan(observation, noise=noise, trace=True).trace.scores[:, 0]
     actual = rough.plan(observation, noise=noise, trace=True).trace.scores[:, 0]
-    torch.testing.assert_close(actual.double(), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(actual, expected, rtol=1e-3, atol=1e-4)
     assert not torch.equal(actual, expected)
+    assert actual.dtype == torch.float64
 
 
 def test_a_compiled_plan_equals_an_eager_one(make_planner, states, assert_same_plan):
-    planner = make_planner(make_model(), iterations=2)
+    planner = make_planner(make_model(), horizon=2, iterations=1)
     observation, noise = states(2), planner.draw_noise(2)
-    compiled = torch.compile(planner.plan, backend="aot_eager", fullgraph=True)
+    compiled = torch.compile(planner.plan, backend="eager", fullgraph=True)
     assert_same_plan(compiled(observation, noise=noise), planner.plan(observation, noise=noise))
 
 
@@ -164,12 +165,12 @@ def test_policy_and_planner_are_exported(make_planner, states):
     torch.testing.assert_close(action, model.policy(model.encode(observation))[0])
     bare = BarePolicy(model)(TensorDict({"observation": observation}, batch_size=[5]))
     torch.testing.assert_close(action, bare["action"])
-    planner = make_planner(model)
+    planner = make_planner(model, horizon=2, iterations=1)
     program = export_planner(planner)
     torch.manual_seed(4)
-    exported, mean = program.module()(observation[:1], torch.zeros(1, 3, 2).double())
+    exported, mean = program.module()(observation[:1], torch.zeros(1, 2, 2).double())
     torch.manual_seed(4)
-    plan = planner.plan(observation[:1], torch.zeros(1, 3, 2).double(), explore=False)
+    plan = planner.plan(observation[:1], torch.zeros(1, 2, 2).double(), explore=False)
     torch.testing.assert_close(exported, plan.action)
     torch.testing.assert_close(mean, plan.mean)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import zipfile
 from pathlib import Path
 
@@ -22,71 +23,83 @@ def make_model(**options) -> WorldModel:
 
 
 def make_planner(model: torch.nn.Module, **options) -> EnsembleMPPIPlanner:
-    budget = {"horizon": 2, "num_samples": 24, "num_elites": 6, "num_proposals": 4, "iterations": 2}
-    return EnsembleMPPIPlanner(LatentEnv(model), **budget, **options)
+    budget = {"horizon": 2, "num_samples": 24, "num_elites": 6, "num_proposals": 4, "iterations": 1}
+    return EnsembleMPPIPlanner(LatentEnv(model), **(budget | options))
 
 
-@pytest.mark.parametrize("states", [1, 2, 7])
-def test_the_exported_policy_acts_like_the_live_one_for_any_number_of_states(states):
-    model, observation = make_model(), torch.randn(states, 5)
-    with torch.no_grad():
-        expected, _ = model.policy(model.encode(observation))
-        torch.testing.assert_close(export_policy(model).module()(observation), expected)
+def assert_plans_like(planner: EnsembleMPPIPlanner, program: torch.nn.Module, states: int) -> None:
+    dtype, action_dim = planner.draw_noise(1).action.dtype, planner.world_model.action_dim
+    observation = torch.randn(states, 5, dtype=dtype)
+    plan_mean = torch.rand(states, 2, action_dim, dtype=dtype) * 2 - 1
+    torch.manual_seed(1)
+    found = program(observation, plan_mean)
+    torch.manual_seed(1)
+    plan = planner.plan(observation, plan_mean if planner.warm_start else None, explore=False)
+    torch.testing.assert_close(found, (plan.action, plan.mean))
+    assert not torch.equal(program(observation, plan_mean)[1], found[1])  # new noise
 
 
-def make_standardising_model() -> WorldModel:
+def not_to_be_called(*args, **kwargs):
+    raise AssertionError("the compiled plan was called")
+
+
+@pytest.fixture(scope="module")
+def exported() -> tuple[EnsembleMPPIPlanner, torch.nn.Module, torch.nn.Module]:
+    """A planner, and the programs that are made of its policy and of itself."""
+    planner = make_planner(make_model(), iterations=2)
+    planner.compiled_plan = not_to_be_called
+    return planner, export_policy(planner.world_model).module(), export_planner(planner).module()
+
+
+def test_the_exported_policy_acts_like_the_live_one_for_any_number_of_states(exported):
+    planner, policy, _ = exported
+    for states in (1, 2, 7):
+        observation = torch.randn(states, 5)
+        with torch.no_grad():
+            expected, _ = planner.world_model.policy(planner.world_model.encode(observation))
+            torch.testing.assert_close(policy(observation), expected)
+
+
+def test_the_exported_planner_plans_like_the_live_one_and_a_compiled_plan_is_left_aside(exported):
+    planner, _, program = exported
+    assert planner.compiled_plan is not_to_be_called
+    assert_plans_like(planner, program, 1)
+
+
+def test_statistics_and_weights_in_double_precision_are_exported():
     model = make_model(normalize_observations=True)
     model.encoder.observe(5 + 3 * torch.randn(64, 5))
-    return model
+    planner = make_planner(model.double())
+    assert_plans_like(planner, export_planner(planner, batch_size=3).module(), 3)
 
 
 @pytest.mark.parametrize(
-    ("make", "states"),
-    [
-        (make_model, 1),
-        (make_standardising_model, 3),
-        (lambda: make_model().double(), 3),
-        (lambda: LineWorld(action_dim=5), 1),
-    ],
+    ("make", "warm_start"), [(lambda: make_model(termination=True), True), (lambda: LineWorld(action_dim=5), False)]
 )
-def test_the_exported_planner_plans_like_the_live_one_and_draws_new_noise(make, states):
-    planner = make_planner(make())
-    dtype = planner.draw_noise(1).action.dtype
-    observation = torch.randn(states, 5, dtype=dtype)
-    plan_mean = torch.rand(states, 2, planner.world_model.action_dim, dtype=dtype) * 2 - 1
-    program = export_planner(planner, batch_size=states).module()
-    torch.manual_seed(1)
-    action, mean = program(observation, plan_mean)
-    torch.manual_seed(1)
-    plan = planner.plan(observation, plan_mean, explore=False)
-    torch.testing.assert_close(action, plan.action)
-    torch.testing.assert_close(mean, plan.mean)
-    assert not torch.equal(program(observation, plan_mean)[1], mean)
-
-
-@pytest.mark.parametrize("make", [lambda: make_model(termination=True), lambda: LineWorld(action_dim=5)])
-def test_one_exported_planner_plans_for_any_number_of_states(make):
-    planner = make_planner(make())
+def test_one_exported_planner_plans_for_any_number_of_states(make, warm_start):
+    planner = make_planner(make(), warm_start=warm_start)
     program = export_planner(planner, batch_size=None).module()
     for states in (1, 2, 7):
-        observation, plan_mean = torch.randn(states, 5), torch.rand(states, 2, planner.world_model.action_dim) * 2 - 1
-        torch.manual_seed(1)
-        action, mean = program(observation, plan_mean)
-        torch.manual_seed(1)
-        plan = planner.plan(observation, plan_mean, explore=False)
-        torch.testing.assert_close(action, plan.action)
-        torch.testing.assert_close(mean, plan.mean)
+        assert_plans_like(planner, program, states)
 
 
-def test_a_compiled_plan_is_not_what_is_exported():
-    planner = make_planner(make_model())
+def test_an_exported_program_does_not_follow_the_live_weights(exported):
+    live, policy, planner = exported
+    model, observation = live.world_model, torch.randn(1, 5)
+    weights = copy.deepcopy(model.state_dict())
 
-    def fail(*args, **kwargs):
-        raise AssertionError("the compiled plan was called")
+    def act() -> list[torch.Tensor]:
+        torch.manual_seed(0)
+        return [policy(observation), planner(observation, torch.zeros(1, 2, 2))[0]]
 
-    planner.compiled_plan = fail
-    export_planner(planner)
-    assert planner.compiled_plan is fail
+    before = act()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.5)
+    try:
+        torch.testing.assert_close(act(), before, rtol=0, atol=0)
+    finally:
+        model.load_state_dict(weights)
 
 
 def an_agents_planner() -> EnsembleMPPIPlanner:
@@ -98,9 +111,8 @@ def an_agents_planner() -> EnsembleMPPIPlanner:
 
 
 # A warning is an error here: PyTorch warns of tensors that are parts of others when it saves them.
-@pytest.mark.parametrize("make", [lambda: make_planner(make_model()), an_agents_planner])
-def test_a_file_holds_the_weights_that_its_program_needs_and_nothing_else(make, tmp_path):
-    planner = make()
+def test_a_file_holds_the_weights_that_its_program_needs_and_nothing_else(tmp_path):
+    planner = an_agents_planner()
     model, files = planner.world_model, [tmp_path / "policy.pt2", tmp_path / "planner.pt2"]
     for program, file in zip([export_policy(model), export_planner(planner)], files, strict=True):
         torch.export.save(program, file)
@@ -112,21 +124,6 @@ def test_a_file_holds_the_weights_that_its_program_needs_and_nothing_else(make, 
 def stored_bytes(path: Path) -> int:
     with zipfile.ZipFile(path) as file:
         return sum(entry.file_size for entry in file.infolist() if "/data/weights/weight_" in entry.filename)
-
-
-def test_an_exported_program_does_not_follow_the_live_weights():
-    model, observation = make_model(), torch.randn(1, 5)
-    policy, planner = export_policy(model).module(), export_planner(make_planner(model)).module()
-
-    def act() -> list[torch.Tensor]:
-        torch.manual_seed(0)
-        return [policy(observation), planner(observation, torch.zeros(1, 2, 2))[0]]
-
-    before = act()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.5)
-    torch.testing.assert_close(act(), before, rtol=0, atol=0)
 
 
 def test_no_batch_is_refused():
@@ -142,14 +139,3 @@ def test_an_example_that_is_no_tensor_is_refused(export):
         TypeError, match="observation must be a tensor, got dict; a model that encodes dictionaries cannot"
     ):
         export(make_model(), observation={"pixels": torch.zeros(3)})
-
-
-def test_a_planner_without_a_warm_start_leaves_the_carried_plan_aside():
-    planner = make_planner(make_model(), warm_start=False)
-    observation, carried = torch.randn(1, 5), torch.full((1, 2, 2), 0.9)
-    program = export_planner(planner).module()
-    found = []
-    for plan in (carried, torch.zeros(1, 2, 2)):
-        torch.manual_seed(1)
-        found.append(program(observation, plan)[0])
-    assert torch.equal(*found)

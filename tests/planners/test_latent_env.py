@@ -8,11 +8,6 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_etdmpc import LatentEnv, WorldModel
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 def make_model(**options) -> WorldModel:
     """A small world model with three dynamics heads whose rewards are not zero."""
     model = WorldModel(3, 2, latent_dim=16, mlp_dim=32, encoder_dim=16, num_dynamics=3, **options)

@@ -12,7 +12,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, Plan, WorldModel
+from torchrl_etdmpc import Plan
 from torchrl_etdmpc.planners import PlanNoise
 
 
@@ -203,24 +203,3 @@ def test_a_plan_compiled_to_kernels_is_that_of_eager_code(make_planner, states, 
         warnings.simplefilter("ignore")  # of the compiler, about the machine
         compiled = torch.compile(planner.plan, fullgraph=True)(observation, noise=noise)
     assert_same_plan(compiled, planner.plan(observation, noise=noise))
-
-
-def test_double_weights_score_in_single_precision_where_that_is_asked_for():
-    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16).double()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.normal_(0.0, 0.5)
-    latent, actions = model.encode(torch.randn(2, 3).double()), torch.rand(2, 5, 3, 2).double()
-    exact, single = (
-        EnsembleMPPIPlanner(LatentEnv(model), horizon=3, scoring_dtype=dtype).imagined_returns(latent, actions)
-        for dtype in (None, torch.float32)
-    )
-    assert single.dtype == torch.float64
-    assert not torch.equal(single, exact)
-    torch.testing.assert_close(single, exact, rtol=1e-3, atol=1e-3)
-
-
-def test_asking_for_the_action_alone_leaves_the_input_as_it_is(make_planner, states):
-    td = TensorDict({"observation": states(4)}, [4])
-    assert make_planner(warm_start=False).planning(td).shape[0] == 4
-    assert set(td.keys()) == {"observation"}

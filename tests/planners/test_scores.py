@@ -10,11 +10,6 @@ import torch
 from torchrl_etdmpc.planners import AdaptiveScore, FinalScore, MeanScore, make_score
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 def penalised(estimates: list[float], beta: float) -> float:
     """``mean - beta * sigma`` with the variance of the mean, written out (thesis Eq. 3.2 and 3.3)."""
     mean, members = fmean(estimates), len(estimates)
@@ -73,7 +68,6 @@ def test_a_single_estimate_has_no_penalty(score):
 
 @pytest.mark.parametrize("score", [FinalScore, MeanScore, AdaptiveScore])
 def test_a_penalty_lowers_the_score_where_heads_disagree(score):
-    assert (score(2.0)(table(6)) < score(1.0)(table(6))).any()
     returns = table(6)
     assert (score(2.0)(returns) < score(0.5)(returns)).all()
     agreed = returns[..., :1, :1].expand_as(returns)
@@ -148,24 +142,3 @@ def test_depths_that_no_planner_knows_are_refused():
 def test_a_score_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
         FinalScore().beta = 1.0
-
-
-def test_an_unknown_score_is_refused():
-    with pytest.raises(ValueError, match=r"^score must be one of final, mean, adaptive or a callable, got 'best'\.$"):
-        make_score("best")
-
-
-def test_a_penalty_beside_a_callable_is_refused():
-    with pytest.raises(
-        ValueError, match=r"^beta=2\.0 has no effect on a score of your own; put the penalty into the callable\.$"
-    ):
-        make_score(FinalScore(), 2.0)
-
-
-def test_adaptive_refuses_optimism():
-    with pytest.raises(
-        ValueError,
-        match=r"^beta must not be negative with the adaptive score, got -1\.0; score='final' and score='mean' take a "
-        r"negative one, for optimism\.$",
-    ):
-        AdaptiveScore(-1.0)

@@ -62,7 +62,12 @@ def test_the_planner_finds_the_optimum_without_proposals():
     planner = make_planner(Line())
     state = TensorDict({"observation": torch.tensor([[0.0], [0.8], [1.25]])}, [3])
     torch.testing.assert_close(planner(state)["plan", "loc"], torch.tensor([[1.0], [0.4], [-0.5]]), atol=0.15, rtol=0)
-    export_planner(planner, batch_size=None)
+
+
+def test_a_planner_over_a_model_without_a_policy_is_exported():
+    planner = make_planner(Line(), iterations=1)
+    action, _ = export_planner(planner, batch_size=None).module()(torch.zeros(3, 1), torch.zeros(3, 2, 1))
+    assert action.shape == (3, 1)
 
 
 def test_the_fallback_is_the_plan_that_was_carried():
