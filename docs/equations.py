@@ -82,14 +82,14 @@ EQUATIONS = (
         "mean over the heads",
         r"\bar Q_h = \frac{1}{F V} \sum_{i,j} Q_h(i, j)",
         f"{_FUNCTIONAL}.ensemble_mean",
-        ("tests/functional/test_horizon.py::test_ensemble_mean_is_the_mean_over_all_pairs_of_heads",),
+        ("tests/functional/test_horizon.py::test_ensemble_mean_and_variance_are_those_of_all_pairs_of_heads",),
     ),
     Equation(
         "thesis Eq. 3.3",
         "variance of that mean",
         r"\sigma_h^2 = \frac{\sum_{i,j} (Q_h(i, j) - \bar Q_h)^2}{F V (F V - 1)}",
         f"{_FUNCTIONAL}.ensemble_variance",
-        ("tests/functional/test_horizon.py::test_ensemble_variance_is_eq_3_3_term_by_term",),
+        ("tests/functional/test_horizon.py::test_ensemble_mean_and_variance_are_those_of_all_pairs_of_heads",),
     ),
     Equation(
         "thesis 3.4.3",

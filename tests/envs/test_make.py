@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
+import inspect
 import io
 import multiprocessing
 import os
@@ -9,6 +11,9 @@ import random
 import signal
 import subprocess
 import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
 from functools import partial
 from types import SimpleNamespace
 
@@ -21,8 +26,8 @@ from torchrl.envs.utils import check_env_specs
 pytest.importorskip("dm_control")
 pytest.importorskip("gymnasium")
 
-from torchrl_etdmpc.envs import Task, check_env, get_task, make_env, register_task  # noqa: E402
-from torchrl_etdmpc.envs.worker import SilentWithoutOwner, make_in_worker, signals_held_back, start_workers  # noqa: E402
+from torchrl_etdmpc.envs import Task, check_env, get_task, make_env, register_task, worker  # noqa: E402
+from torchrl_etdmpc.envs.worker import SilentWithoutOwner, make_in_worker, start_workers  # noqa: E402
 
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("imageio") is None, reason="needs gymnasium[mujoco]")
 
@@ -34,7 +39,13 @@ def own(task: Task, *, device: torch.device | str) -> EnvBase:
     return env.append_transform(StepCounter(task.decision_steps_per_episode))
 
 
+def own_walker(task: Task, *, device: torch.device | str) -> EnvBase:
+    """A user's maker that makes a task of dm_control."""
+    return make_env(get_task("walker-walk", episode_length=task.episode_length), device=device)
+
+
 register_task(Task("own-pendulum", "mine", episode_length=200, terminates=False), own)
+register_task(Task("own-walker", "mine", action_repeat=2, episode_length=1000, terminates=False), own_walker)
 
 TASKS = [
     "pendulum-swingup",
@@ -174,7 +185,7 @@ def test_several_environments_have_the_entries_of_one_and_seeds_of_their_own(nam
     assert torch.equal(start[0], single.reset()["observation"])
 
 
-@pytest.mark.parametrize("name", [pytest.param("gym/Pendulum-v1", marks=pytest.mark.slow), "own-pendulum"])
+@pytest.mark.parametrize("name", [pytest.param("gym/Pendulum-v1", marks=pytest.mark.slow), "own-walker"])
 def test_worker_processes_play_what_this_process_would(name):
     threads = torch.get_num_threads()
     rows = []
@@ -314,51 +325,82 @@ def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
     assert text.getvalue() == "a warning"
 
 
+@pytest.fixture
+def copied() -> Iterator[Callable[[Callable[[], None]], int]]:
+    """Runs a function in a copy of this process, which needs no imports; returns the number of the process."""
+    processes = []
+
+    def run(function: Callable[[], None]) -> int:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
+            process = os.fork()
+        if process == 0:
+            try:
+                function()
+            finally:
+                os._exit(0)
+        processes.append(process)
+        return process
+
+    yield run
+    for process in processes:
+        with contextlib.suppress(ChildProcessError):  # it was waited for
+            if os.waitpid(process, os.WNOHANG) == (0, 0):
+                os.kill(process, signal.SIGKILL)
+                os.waitpid(process, 0)
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="needs POSIX signals")
-def test_a_worker_outlives_a_signal_for_as_long_as_its_owner_lives():
-    program = (
-        "import time, torchrl_etdmpc.envs.worker as worker\n"
-        "worker._GRACE_S = 1\n"
-        "worker._outlive_signals(0)\n"  # stdin, which ends with this process as a sentinel does
-        "print('ready', flush=True)\n"
-        "while True:\n"
-        "    time.sleep(60)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"ready\n"
-    process.send_signal(signal.SIGTERM)
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(timeout=2.5)
-    process.stdin.close()
-    assert process.wait(timeout=30) == 1
-    process.stdout.close()
+def test_a_worker_outlives_a_signal_for_as_long_as_its_owner_lives(monkeypatch, copied):
+    monkeypatch.setattr(worker, "_GRACE_S", 1)
+    sentinel, owner = os.pipe()
+    ready, tell = os.pipe()
+
+    def work() -> None:
+        os.close(owner)
+        worker._outlive_signals(sentinel)
+        os.write(tell, b"!")
+        while True:
+            time.sleep(60)
+
+    process = copied(work)
+    assert os.read(ready, 1) == b"!"
+    os.kill(process, signal.SIGTERM)
+    time.sleep(2.5)
+    assert os.waitpid(process, os.WNOHANG) == (0, 0)
+    os.close(owner)  # as the system does when the owner's process ends
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 1
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs POSIX signals")
-def test_a_process_that_is_just_starting_answers_a_signal_when_it_is_ready():
+def test_a_process_that_is_just_starting_answers_a_signal_when_it_is_ready(copied):
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    program = (
-        "import signal, sys, torchrl_etdmpc.envs.worker as worker\n"
-        "sys.stdin.readline()\n"
-        "print('importing')\n"
-        "worker.take_signals(lambda number, _: print(signal.Signals(number).name))\n"
-    )
-    with signals_held_back():
-        process = subprocess.Popen(
-            [sys.executable, "-c", program], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+    signalled, signal_sent = os.pipe()
+    told, tell = os.pipe()
+
+    def start() -> None:
+        os.read(signalled, 1)
+        os.write(tell, b"importing ")
+        worker.take_signals(lambda number, _: os.write(tell, signal.Signals(number).name.encode()))
+
+    with worker.signals_held_back():
+        process = copied(start)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
-    process.send_signal(signal.SIGINT)
-    out, _ = process.communicate("\n", timeout=60)
-    assert (process.returncode, out.split()) == (0, ["importing", "SIGINT"])
+    os.kill(process, signal.SIGINT)
+    os.write(signal_sent, b"!")
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0
+    assert os.read(told, 100) == b"importing SIGINT"
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs POSIX signals")
 def test_signals_stay_held_back_when_the_first_semaphore_is_made():
     """It starts the process that tracks semaphores, after which Python unblocks SIGINT and SIGTERM."""
     program = (
-        "import multiprocessing, signal\n"
-        "from torchrl_etdmpc.envs.worker import signals_held_back\n"
+        "from __future__ import annotations\n"
+        "import contextlib, multiprocessing, signal\n"
+        "from multiprocessing import resource_tracker\n"
+        f"STOP_SIGNALS = {[number.value for number in worker.STOP_SIGNALS]}\n"
+        f"{inspect.getsource(worker.signals_held_back)}\n"  # alone: the package's imports take seconds
         "with signals_held_back():\n"
         "    multiprocessing.get_context('spawn').Event()\n"
         "    held = signal.pthread_sigmask(signal.SIG_BLOCK, [])\n"
