@@ -88,10 +88,6 @@ def expected_return(length: int, action: float = 0.5) -> float:
     return length * (length + 1) / 2 + length * action
 
 
-def test_a_return_is_the_sum_of_an_episode_s_rewards():
-    assert evaluate(CountingEnv(4), ConstantPolicy(), episodes=1).returns.tolist() == [expected_return(4)]
-
-
 def test_a_return_equals_that_of_an_independent_rollout():
     pytest.importorskip("dm_control")
     from torchrl_etdmpc.envs import make_env
@@ -212,20 +208,6 @@ def test_the_warm_start_is_carried_through_a_round_and_reset_between_rounds(batc
     evaluate(env, planner, episodes=4 if batched else 2)
     assert len(carried) == 8
     assert [bool(plan_mean.any()) for plan_mean in carried] == [False, True, True, True] * 2
-
-
-def test_the_bare_policy_acts_with_the_mean_whatever_the_exploration():
-    torch.manual_seed(0)
-    world_model = WorldModel(3, 2, latent_dim=16, mlp_dim=16)
-    observation = torch.randn(5, 3)
-    mean, log_std = world_model.policy(world_model.encode(observation))
-    assert (log_std > -3).all()  # or a sample would be close to the mean by chance
-    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
-        with set_exploration_type(kind):
-            out = BarePolicy(world_model)(TensorDict({"observation": observation}, [5]))
-        assert torch.equal(out["action"], mean)
-        assert not out["action"].requires_grad
-        assert set(out.keys()) == {"observation", "action"}
 
 
 def test_an_environment_of_other_bounds_is_refused_before_it_is_stepped():

@@ -11,23 +11,6 @@ from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, SeedPolicy, WorldMode
 BOUNDS = Bounded(-1, 1, shape=(2,))
 
 
-def test_actions_are_uniform_in_the_planner_s_bounds():
-    torch.manual_seed(0)
-    spec = BOUNDS.expand(4000, 2)
-    actions = SeedPolicy(spec)(TensorDict(batch_size=[4000]))["action"].double()
-    for dimension in range(2):
-        assert kstest(actions[:, dimension], "uniform", args=(-1, 2)).pvalue > 1e-3
-
-
-def test_successive_actions_differ_and_follow_torch_manual_seed():
-    policy = SeedPolicy(BOUNDS)
-    torch.manual_seed(0)
-    first, second = (policy(TensorDict())["action"] for _ in range(2))
-    torch.manual_seed(0)
-    assert torch.equal(policy(TensorDict())["action"], first)
-    assert not torch.equal(first, second)
-
-
 def run_lengths(actions: torch.Tensor) -> torch.Tensor:
     """For how many decisions each value of a column ``[T, N]`` stays, the last one left out."""
     changes = torch.nn.functional.pad((actions[1:] != actions[:-1]).T, (1, 0), value=True)  # [N, T]

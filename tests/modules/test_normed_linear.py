@@ -6,7 +6,6 @@ import torch.nn.functional as F
 from torch import nn
 
 from torchrl_etdmpc.modules import MLP, EnsembleLinear, NormedLinear
-from torchrl_etdmpc.modules.normed_linear import INIT_STD
 
 
 def identity(x: torch.Tensor) -> torch.Tensor:
@@ -25,36 +24,6 @@ def member(stack: MLP, index: int, alone: MLP) -> MLP:
     """Loads one member of a stack into a network built alone."""
     alone.load_state_dict({name: tensor[index] for name, tensor in stack.state_dict().items()})
     return alone
-
-
-@pytest.mark.parametrize("num_members", [None, 1, 5])
-@pytest.mark.parametrize("build", [EnsembleLinear, lambda *a, **k: NormedLinear(*a, activation=F.mish, **k)])
-def test_every_members_weights_have_std_0_02_and_its_biases_are_zero(build, num_members):
-    layer = build(200, 300, num_members=num_members)
-    weights = layer.weight if num_members else layer.weight.unsqueeze(0)
-    assert weights.shape == (num_members or 1, 200, 300)
-    for weight in weights:
-        assert weight.std().item() == pytest.approx(INIT_STD, rel=0.02)
-        assert abs(weight.mean().item()) < 5 * INIT_STD / weight.numel() ** 0.5
-    assert INIT_STD == 0.02
-    assert layer.bias.count_nonzero() == 0
-
-
-def test_members_start_with_different_weights():
-    weight = EnsembleLinear(8, 8, num_members=3).weight
-    for i, j in [(0, 1), (0, 2), (1, 2)]:
-        assert (weight[i] != weight[j]).all()
-
-
-def test_layer_norm_starts_as_the_identity():
-    layer = NormedLinear(8, 16, activation=F.mish, num_members=3)
-    assert torch.equal(layer.norm_weight, torch.ones(3, 16))
-    assert torch.equal(layer.norm_bias, torch.zeros(3, 16))
-
-
-def test_zero_init_starts_at_zero():
-    layer = EnsembleLinear(8, 16, num_members=3, zero_init=True)
-    assert layer.weight.count_nonzero() == layer.bias.count_nonzero() == 0
 
 
 def test_a_linear_layer_equals_torchs():
@@ -110,36 +79,10 @@ def test_dropout_comes_before_the_layer_norm():
     assert ((share > 0.4) & (share < 0.6)).all()
 
 
-@pytest.mark.parametrize("training", [True, False])
-def test_dropout_acts_only_when_asked_for_whatever_the_training_mode(training):
-    network = MLP(5, [64, 64], 7, dropout=0.5).train(training)
-    x = torch.randn(3, 5)
-    assert torch.equal(network(x), network(x))
-    assert not torch.equal(network(x, dropout=True), network(x, dropout=True))
-    assert not torch.equal(network(x, dropout=True), network(x))
-
-
 def test_a_dropout_of_zero_changes_nothing():
     network = MLP(5, [64], 7, dropout=0.0)
     x = torch.randn(3, 5)
     assert torch.equal(network(x, dropout=True), network(x))
-
-
-def test_only_the_first_hidden_layer_drops():
-    network = MLP(5, [8, 8, 8], 7, dropout=0.3, output_activation=F.mish)
-    assert [layer.dropout for layer in (*network.hidden, network.output)] == [0.3, 0.0, 0.0, 0.0]
-
-
-def test_dropout_is_drawn_for_each_member():
-    network = MLP(5, [64], 7, num_members=2, dropout=0.5)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter[1] = parameter[0]
-    x = torch.randn(3, 5).expand(2, 3, 5)
-    first, second = network(x)
-    torch.testing.assert_close(first, second)
-    first, second = network(x, dropout=True)
-    assert (first != second).all()
 
 
 @pytest.mark.parametrize("output_activation", [None, F.silu])
@@ -152,16 +95,6 @@ def test_a_member_of_a_stack_equals_the_same_network_built_alone(output_activati
     for i in range(4):
         alone = member(stack, i, MLP(5, [16, 12], 7, **options))
         torch.testing.assert_close(out[i], alone(x[i]), rtol=1e-5, atol=1e-5)
-
-
-def test_members_share_nothing():
-    stack = randomise(MLP(5, [16], 7, num_members=3, output_activation=F.mish))
-    out = stack(torch.randn(3, 4, 5))
-    for i in range(3):
-        gradients = torch.autograd.grad(out[i].square().sum(), list(stack.parameters()), retain_graph=True)
-        for gradient in gradients:
-            for j in range(3):
-                assert (gradient[j].count_nonzero() > 0) == (i == j)
 
 
 @pytest.mark.parametrize(("activation", "function"), [("mish", F.mish), ("silu", F.silu), ("relu", F.relu)])
@@ -179,40 +112,6 @@ def test_the_default_activation_is_mish():
     other.load_state_dict(network.state_dict())
     x = torch.randn(3, 5)
     assert torch.equal(network(x), other(x))
-
-
-def test_an_unknown_activation_is_refused_with_the_choices():
-    with pytest.raises(ValueError, match=r"^activation must be one of mish, silu, relu, got 'tanh'\.$"):
-        MLP(5, [16], 7, activation="tanh")
-
-
-@pytest.mark.parametrize("num_members", [None, 3])
-def test_a_reset_draws_new_weights_and_restores_zeros_and_the_layer_norm(num_members):
-    network = MLP(5, [16], 7, num_members=num_members, zero_init_output=True)
-    before = network.hidden[0].weight.clone()
-    randomise(network)
-    network.reset_parameters_recursive()
-    hidden, output = network.hidden[0], network.output
-    assert (hidden.weight != before).all()
-    assert hidden.weight.abs().max() < 0.2
-    assert hidden.bias.count_nonzero() == hidden.norm_bias.count_nonzero() == 0
-    assert torch.equal(hidden.norm_weight, torch.ones_like(hidden.norm_weight))
-    assert output.weight.count_nonzero() == output.bias.count_nonzero() == 0
-
-
-def test_a_reset_of_a_normed_output_layer_restores_its_layer_norm():
-    network = randomise(MLP(5, [16], 7, output_activation=F.mish))
-    network.reset_parameters_recursive()
-    assert torch.equal(network.output.norm_weight, torch.ones(7))
-    assert network.output.norm_bias.count_nonzero() == 0
-    assert network.output.weight.std() < 0.05
-
-
-def test_every_parameter_receives_a_gradient():
-    stack = randomise(MLP(5, [16, 16], 7, num_members=2, output_activation=F.mish))
-    stack(torch.randn(2, 4, 5)).square().sum().backward()
-    for name, parameter in stack.named_parameters():
-        assert parameter.grad.count_nonzero() > 0, name
 
 
 def test_the_printed_layer_shows_its_sizes():

@@ -38,15 +38,6 @@ def test_what_is_far_out_is_clipped():
     assert norm(torch.tensor([-1e6])) == -10
 
 
-def test_a_batch_that_is_not_finite_is_forgotten():
-    norm = RunningNorm(2)
-    norm.observe(torch.randn(64, 2))
-    before = norm.mean.clone(), norm.variance.clone()
-    norm.observe(torch.full((64, 2), torch.nan))
-    assert torch.equal(norm.mean, before[0])
-    assert torch.equal(norm.variance, before[1])
-
-
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, 1e30])
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_batch_that_is_not_finite_is_no_batch_also_where_it_is_the_first(wrong, masked):

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, WorldModel, export_planner, export_policy
+from torchrl_etdmpc import EnsembleMPPIPlanner, LatentEnv, export_planner, export_policy
 from torchrl_etdmpc.modules import has_policy, require_prediction_model
 from torchrl_etdmpc.planners import BarePolicy
 
@@ -100,12 +100,6 @@ def test_an_activation_called_act_is_no_policy():
     model.act = nn.Mish()
     assert not has_policy(model)
     assert make_planner(model).plan(torch.zeros(1, 1), explore=False).action.shape == (1, 1)
-
-
-def test_the_policy_alone_says_which_observation_it_misses():
-    model = WorldModel(3, 2, latent_dim=16, mlp_dim=16, encoder_dim=16)
-    with pytest.raises(KeyError, match=r"the policy needs 'seen' in its input; pass observation_key="):
-        BarePolicy(model, observation_key="seen")(TensorDict({"observation": torch.zeros(1, 3)}, [1]))
 
 
 def test_a_search_cannot_begin_at_a_policy_that_is_not_there():

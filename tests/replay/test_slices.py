@@ -111,7 +111,7 @@ def contiguous(lengths: list[int], rows: int) -> list[tuple[int, int]]:
     return interleaved(lengths, 1, rows)
 
 
-@settings(max_examples=80, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
+@settings(max_examples=60, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
 @given(
     lengths=st.lists(st.integers(1, 12), min_size=1, max_size=8),
     num_envs=st.integers(1, 4),
@@ -133,8 +133,7 @@ def test_the_slices_that_can_be_drawn_are_exactly_the_valid_ones(
             assert ring.every_drawn_slice() == ring.every_valid_slice()
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize("capacity", [60, 61, 67])
+@pytest.mark.parametrize(("capacity", "num_envs"), [(60, 1), (61, 3)])
 def test_no_slice_of_a_full_ring_crosses_a_border_or_the_write_head(capacity, num_envs):
     ring = Ring(capacity, 4)
     ring.write(interleaved([10], num_envs, 60))
@@ -182,7 +181,7 @@ def test_one_trajectory_that_goes_on_with_another_stride_is_joined():
     assert {(0, 2, 4), (2, 4, 6), (4, 6, 7), (7, 8, 9)} <= ring.every_drawn_slice()
 
 
-@settings(max_examples=60, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
+@settings(max_examples=40, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
 @given(
     num_envs=st.integers(1, 4),
     lengths=st.lists(st.integers(1, 9), min_size=1, max_size=5),
@@ -300,9 +299,8 @@ def test_padded_rows_are_never_sampled():
     assert _drawn(buffer, 2) == {(0, 1), (1, 2), (3, 4)}
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
-def test_batches_of_a_torchrl_collector_are_sliced_within_trajectories(num_envs):
-    limits = [4, 6, 9][:num_envs]
+def test_batches_of_a_torchrl_collector_are_sliced_within_trajectories():
+    limits, num_envs = [4, 6, 9], 3
     env = SerialEnv(num_envs, [lambda limit=limit: CountingEnv(max_steps=limit) for limit in limits])
     collector = Collector(
         env,
@@ -334,12 +332,6 @@ def test_a_sample_holds_exactly_batch_size_over_slice_len_slices(slice_len, num_
     sample = ring.buffer.sample(num_slices * slice_len)
     assert sample.batch_size == (num_slices * slice_len,)
     assert (sample.reshape(-1, slice_len)["t"].diff() == 1).all()
-
-
-def test_slices_of_one_step_are_single_rows():
-    ring = Ring(10, 1, uniform_over="starts")
-    ring.write(contiguous([1, 2, 3], 17))
-    assert {rows[0] for rows in ring.every_drawn_slice()} == set(range(10))
 
 
 def _is_uniform(counts: np.ndarray) -> bool:
@@ -491,15 +483,6 @@ def test_an_emptied_buffer_starts_afresh():
     assert ring.every_drawn_slice() == ring.every_valid_slice()
 
 
-def test_rows_added_one_by_one_equal_rows_written_at_once():
-    rows = interleaved([5, 3], 2, 40)
-    together, apart = Ring(17, 3), Ring(17, 3)
-    apart.write(rows, one_by_one=True)
-    for begin in range(0, 40, 8):
-        together.write(rows[begin : begin + 8])
-    assert apart.every_drawn_slice() == together.every_drawn_slice() == apart.every_valid_slice()
-
-
 def test_what_a_seed_draws_follows_from_the_order_of_writing_and_not_from_the_ids():
     drawn = []
     for ids in ([0, 1], [9, 4]):
@@ -566,14 +549,14 @@ def _sizes_of_the_table(ring: Ring, rows: list[tuple[int, int]], chunk: int) -> 
 
 
 @pytest.mark.parametrize("length", [3, 1])  # of every slice; with 1 the oldest row is a trajectory of its own
-def test_the_table_of_trajectories_stays_bounded_after_thousands_of_evicted_ones(length):
-    sizes = _sizes_of_the_table(Ring(60, length), contiguous([length], 2100 * length), 40)
+def test_the_table_of_trajectories_stays_bounded_after_hundreds_of_evicted_ones(length):
+    sizes = _sizes_of_the_table(Ring(60, length), contiguous([length], 700 * length), 40)
     assert max(sizes) < 150  # 60 / length trajectories fit into the ring
 
 
 def test_one_endless_trajectory_does_not_keep_the_table_from_shrinking():
     ring = Ring(60, 3)
-    rows = [row for step in range(3000) for row in ((0, step), (1 + step // 3, step % 3))]
+    rows = [row for step in range(900) for row in ((0, step), (1 + step // 3, step % 3))]
     assert max(_sizes_of_the_table(ring, rows, 28)) < 150
 
 
@@ -794,7 +777,7 @@ def test_partial_slices_know_the_ends_when_the_table_has_been_packed():
     buffer = _buffer(3, partial=True)
     for begin in range(0, 600, 4):  # past several packings
         buffer.extend(_rows([begin] * 4, done=[3], t=torch.arange(begin, begin + 4)))
-        first = buffer.sample(9000)["t"].reshape(-1, 3)[:, 0].unique().tolist()
+        first = buffer.sample(4500)["t"].reshape(-1, 3)[:, 0].unique().tolist()
         assert first == list(range(max(begin - 46, 0), begin + 4))
 
 
