@@ -75,6 +75,13 @@ def test_value_dropout_acts_only_when_asked_for_and_never_through_the_training_m
     assert not torch.equal(dropped, model.value_head(latent))
 
 
+def test_values_do_not_depend_on_the_dropout_rate(randomised):
+    model, other = randomised(dropout=0.0), randomised(dropout=0.9)
+    other.load_state_dict(model.state_dict())
+    latent = simnorm(torch.randn(7, L))
+    assert torch.equal(other.values(latent), model.values(latent))
+
+
 def test_value_heads_drop_independently(randomised):
     head = randomised(dropout=0.5).value_head
     with torch.no_grad():

@@ -47,30 +47,6 @@ def test_no_warning_is_raised_by_building_calling_saving_or_copying(
         loss(**keywords_of(kind, slices))
 
 
-def test_a_flat_batch_is_answered_with_the_reshape_that_it_needs(loss, slices):
-    with pytest.raises(
-        ValueError, match=r"needs a batch of slices \[B, T\].*\[12, 5\].*sample.reshape\(-1, slice_len\)"
-    ):
-        loss(slices.reshape(-1))
-    with pytest.raises(ValueError, match=r"needs a batch of slices \[B, T\].*\[3, 5\]"):
-        loss(slices[0])
-    with pytest.raises(ValueError, match=r"needs a batch of slices \[B, T\].*\[1, 4, 3, 5\]"):
-        loss(slices[None])
-
-
-def test_a_reward_without_its_trailing_dimension_is_refused(make_loss, slices):
-    slices["next", "reward"] = slices["next", "reward"].squeeze(-1)
-    with pytest.raises(ValueError, match=r"features\], got \('next', 'reward'\) of shape \[4, 3\]"):
-        make_loss("model")(slices)
-
-
-def test_a_missing_key_is_named_together_with_the_way_to_rename_it(make_loss, slices):
-    with pytest.raises(KeyError, match=r"needs the key \('next', 'observation'\).*set_keys\(observation="):
-        make_loss("model")(slices.exclude(("next", "observation")))
-    with pytest.raises(KeyError, match=r"needs the key \('plan', 'scale'\).*set_keys\(plan_scale="):
-        make_loss("policy")(slices.exclude(("plan", "scale")))
-
-
 @pytest.mark.parametrize(
     ("kinds", "option", "value", "message"),
     [

@@ -35,14 +35,13 @@ def test_the_loss_and_its_gradient_equal_a_plain_reference_written_head_by_head_
     assert_same_gradients(gradients(actual, world_model), gradients(expected, world_model))
 
 
-@pytest.mark.parametrize("kl_direction", [None, "backward", "forward"])
+@pytest.mark.parametrize("kl_direction", ["backward", "forward"])
 def test_the_divergence_of_a_constant_policy_is_the_closed_form_of_its_direction(
     make_world_model, make_loss, slices, constant_policy, kl_direction
 ):
     world_model = make_world_model()
     constant_policy(world_model, _MEAN, _STD)
-    options = {} if kl_direction is None else {"kl_direction": kl_direction}
-    loss = make_loss("policy", world_model, entropy_coef=0.0, **options).eval()
+    loss = make_loss("policy", world_model, entropy_coef=0.0, kl_direction=kl_direction).eval()
     _set_plan(slices, torch.tensor([0.1, 0.3, -0.5]), torch.tensor([0.7, 0.2, 0.3]))
     pi, plan = Normal(_MEAN, _STD), Normal(torch.tensor([0.1, 0.3, -0.5]), torch.tensor([0.7, 0.2, 0.3]))
     backward, forward = kl_divergence(pi, plan).mean(), kl_divergence(plan, pi).mean()
@@ -53,28 +52,17 @@ def test_the_divergence_of_a_constant_policy_is_the_closed_form_of_its_direction
     torch.testing.assert_close(out["loss_policy"], _RHO_MEAN * expected)
 
 
-def test_the_divergence_is_a_mean_over_action_dimensions(make_world_model, make_loss, slices, constant_policy):
-    world_model = make_world_model()
-    constant_policy(world_model, _MEAN, _STD)
-    loss = make_loss("policy", world_model).eval()
-    _set_plan(slices, _MEAN, _STD * torch.tensor([1.0, 2.0, 1.0]))
-    one_dimension = math.log(2) + 1 / 8 - 1 / 2
-    torch.testing.assert_close(loss(slices)["policy_kl"].item(), one_dimension / 3)
-
-
-@pytest.mark.parametrize("scale", [1.0, 17.0])
-@pytest.mark.parametrize("entropy_coef", [1e-4, 0.1])
 def test_a_policy_that_equals_the_plan_pays_the_entropy_times_its_coefficient_and_a_once(
-    make_world_model, make_loss, slices, constant_policy, scale, entropy_coef
+    make_world_model, make_loss, slices, constant_policy
 ):
     world_model = make_world_model()
     constant_policy(world_model, _MEAN, _STD)
-    loss = make_loss("policy", world_model, entropy_coef=entropy_coef).eval()
-    loss.kl_scale.fill_(scale)
+    loss = make_loss("policy", world_model, entropy_coef=0.1).eval()
+    loss.kl_scale.fill_(17.0)
     _set_plan(slices, _MEAN, _STD)
     entropy = Normal(_MEAN, _STD).entropy().sum().item()
     out = loss(slices)
-    torch.testing.assert_close(out["loss_policy"].item(), -entropy_coef * entropy * 3 * _RHO_MEAN)
+    torch.testing.assert_close(out["loss_policy"].item(), -0.1 * entropy * 3 * _RHO_MEAN)
     torch.testing.assert_close(out["policy_entropy"].item(), entropy)
     torch.testing.assert_close(out["policy_kl"].item(), 0.0)
 

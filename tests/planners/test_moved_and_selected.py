@@ -122,18 +122,18 @@ def test_forward_takes_a_generator():
 # tensordict reads a switch that torch deprecates
 @pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
 def test_a_compiled_planner_takes_batches_of_several_sizes():
-    planner = make_planner(horizon=1, iterations=1)
+    planner = EnsembleMPPIPlanner(LatentEnv(LineWorld()), **(BUDGET | {"iterations": 1}))
     torch.compiler.reset()
     compiled = torch.compile(planner.plan, backend="eager")
     for count in (2, 5, 7):
-        observation = torch.randn(count, 3)
+        observation = torch.randn(count, 1)
         torch.manual_seed(0)
         expected = planner.plan(observation).action
         torch.manual_seed(0)
         assert torch.equal(compiled(observation).action, expected)
     module = torch.compile(planner, backend="eager")
     for count in (2, 5):
-        data = TensorDict({"observation": torch.randn(count, 3), "plan_mean": torch.zeros(count, 1, 1)}, [count])
+        data = TensorDict({"observation": torch.randn(count, 1), "plan_mean": torch.zeros(count, 2, 1)}, [count])
         assert module(data)["action"].shape == (count, 1)
 
 
