@@ -350,6 +350,17 @@ def copied() -> Iterator[Callable[[Callable[[], None]], int]]:
                 os.waitpid(process, 0)
 
 
+def exit_code(process: int, seconds: float = 30) -> int | None:
+    """That of a process of these tests; ``None`` if it is still there after some seconds."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        ended, status = os.waitpid(process, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.01)
+    return None
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="needs POSIX signals")
 def test_a_worker_outlives_a_signal_for_as_long_as_its_owner_lives(monkeypatch, copied):
     monkeypatch.setattr(worker, "_GRACE_S", 1)
@@ -364,12 +375,12 @@ def test_a_worker_outlives_a_signal_for_as_long_as_its_owner_lives(monkeypatch, 
             time.sleep(60)
 
     process = copied(work)
+    os.close(tell)
     assert os.read(ready, 1) == b"!"
     os.kill(process, signal.SIGTERM)
-    time.sleep(2.5)
-    assert os.waitpid(process, os.WNOHANG) == (0, 0)
+    assert exit_code(process, 2.5) is None
     os.close(owner)  # as the system does when the owner's process ends
-    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 1
+    assert exit_code(process) == 1
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs POSIX signals")
@@ -385,10 +396,11 @@ def test_a_process_that_is_just_starting_answers_a_signal_when_it_is_ready(copie
 
     with worker.signals_held_back():
         process = copied(start)
+    os.close(tell)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
     os.kill(process, signal.SIGINT)
     os.write(signal_sent, b"!")
-    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0
+    assert exit_code(process) == 0
     assert os.read(told, 100) == b"importing SIGINT"
 
 
