@@ -38,7 +38,7 @@ KEPT = {"cpu-ablation": "ablation", "adaptive": "adaptive"}
 ENV_STEPS = 50_000
 STEPS = range(10_000, ENV_STEPS + 1, 10_000)
 LEAST_SEEDS = 3
-"""For an interval over seeds: that of two is wider than what a task can return."""
+"""For an interval over seeds: that of two is thirteen times as wide as the two are apart."""
 
 
 def file_of(name: str) -> Path:
@@ -175,7 +175,7 @@ def tasks_table(rows: pd.DataFrame, experiment: Experiment) -> list[str]:
     counts = rows.groupby("task").size()
     enough = [task for task, count in counts.items() if count >= LEAST_SEEDS]
     if len(enough) > 1:
-        name = "these tasks" if len(enough) == len(counts) else f"those with {LEAST_SEEDS} seeds"
+        name = "these tasks" if len(enough) == len(counts) else f"those with {LEAST_SEEDS} seeds or more"
         means = returns.groupby("task").mean().loc[enough].mean()
         cells = [f"{mean:.0f}" for mean in means] + [written(*interval_over_seeds(differences.loc[enough]))]
         lines.append(f"| {name} |  | {' | '.join(cells)} |")

@@ -84,7 +84,7 @@ def test_tasks_with_few_seeds_are_not_in_the_interval_over_seeds(script, tmp_pat
     script.main()
     page = (tmp_path / "ablation" / "README.md").read_text()
     # A standard error of 11.5 / sqrt(2) and four degrees of freedom, t 2.776.
-    assert "| those with 3 seeds |  | 0 | 30 | +30 [+7, +53] |" in page
+    assert "| those with 3 seeds or more |  | 0 | 30 | +30 [+7, +53] |" in page
 
 
 def test_seeds_that_all_differ_alike_leave_no_doubt(script):
