@@ -18,6 +18,7 @@ pytest.importorskip("dm_control")
 
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError  # noqa: E402
 from torchrl_etdmpc.envs import make_env  # noqa: E402
+from torchrl_etdmpc.runs import processor, source_commit
 from torchrl_etdmpc.training import (  # noqa: E402
     EvaluationResult,
     Evaluator,
@@ -146,7 +147,7 @@ def test_the_summary_states_the_run_and_its_result(finished, read_table):
     learned = 160 / 2 - finished.config.seed_decisions  # the task repeats actions twice
     assert summary["decisions_per_second"] == pytest.approx(learned / finished.run.state.learning_s)
     assert summary["parameters"] == sum(p.numel() for p in finished.run.learner.agent.world_model.parameters())
-    assert summary["device"] == "cpu"
+    assert (summary["device"], summary["processor"], summary["commit"]) == ("cpu", processor(), source_commit())
     assert {"python", "torch", "torchrl", "tensordict"} <= set(summary["versions"])
     assert {name: summary[name] for name in finished.summary} == finished.summary
 

@@ -9,7 +9,7 @@ from torchrl_etdmpc.runs.log import COUNTER_COLUMNS, EVAL_COLUMNS, RunLog
 from torchrl_etdmpc.runs.loggers import LoggerName, make_logger, require_logger
 from torchrl_etdmpc.runs.machine import machine_memory, processor, usable_cores
 from torchrl_etdmpc.runs.progress_bar import ProgressBar, progress_bar
-from torchrl_etdmpc.runs.versions import library_versions
+from torchrl_etdmpc.runs.versions import library_versions, source_commit
 from torchrl_etdmpc.runs.video import write_film, write_mp4
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "progress_bar",
     "replacing",
     "require_logger",
+    "source_commit",
     "usable_cores",
     "write_film",
     "write_mp4",

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl_etdmpc.checkpoints import Part
 from torchrl_etdmpc.collectors import NonFiniteError, SimulatorError
 from torchrl_etdmpc.envs import success_return
-from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, progress_bar
+from torchrl_etdmpc.runs import ProgressBar, RunDirectory, RunLog, first_line, processor, progress_bar, source_commit
 from torchrl_etdmpc.training.agent_file import AgentFile, BestAgent
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.distributed import WorkerCollector
@@ -92,6 +92,7 @@ class TrainingRun:
         }
         self.checkpoints = RunCheckpoints(config, log.directory, self.learner, self.best, self.parts)
         self._compile_s = 0.0
+        self._commit = source_commit()  # now: by the end of a long run the files may be others than those that it runs
         self._threads = torch.get_num_threads()  # closing a batched environment changes it
 
     @property
@@ -287,7 +288,9 @@ class TrainingRun:
             "decisions_per_second": learned / state.learning_s if state.learning_s else math.nan,
             "parameters": sum(parameter.numel() for parameter in self.learner.agent.world_model.parameters()),
             "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+            "processor": processor(),
             "threads": self._threads,
+            "commit": self._commit,
         }
 
 
