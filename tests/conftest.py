@@ -50,12 +50,12 @@ def leave_free() -> Callable[[Path, int | None], None]:
 
 
 @pytest.fixture(scope="session")
-def in_copy() -> Callable[[Callable[[], Any]], int]:
-    """Runs a function in a copy of this process; returns its status as ``os.waitpid`` gives it, 0 if it returned."""
+def begin_in_copy() -> Callable[[Callable[[], Any]], int]:
+    """Begins a function in a copy of this process, which needs no imports; returns the number of the process."""
     if not hasattr(os, "fork"):
         pytest.skip("needs fork")
 
-    def run(function: Callable[[], Any]) -> int:
+    def begin(function: Callable[[], Any]) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
             child = os.fork()
@@ -65,9 +65,15 @@ def in_copy() -> Callable[[Callable[[], Any]], int]:
             except BaseException:
                 os._exit(1)
             os._exit(0)
-        return os.waitpid(child, 0)[1]
+        return child
 
-    return run
+    return begin
+
+
+@pytest.fixture(scope="session")
+def in_copy(begin_in_copy: Callable[[Callable[[], Any]], int]) -> Callable[[Callable[[], Any]], int]:
+    """Runs a function in a copy of this process; returns its status as ``os.waitpid`` gives it, 0 if it returned."""
+    return lambda function: os.waitpid(begin_in_copy(function), 0)[1]
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from types import SimpleNamespace
@@ -326,21 +325,13 @@ def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
 
 
 @pytest.fixture
-def copied() -> Iterator[Callable[[Callable[[], None]], int]]:
-    """Runs a function in a copy of this process, which needs no imports; returns the number of the process."""
+def copied(begin_in_copy: Callable[[Callable[[], None]], int]) -> Iterator[Callable[[Callable[[], None]], int]]:
+    """Begins a function in a copy of this process, which ends with the test."""
     processes = []
 
     def run(function: Callable[[], None]) -> int:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a fork beside PyTorch's threads
-            process = os.fork()
-        if process == 0:
-            try:
-                function()
-            finally:
-                os._exit(0)
-        processes.append(process)
-        return process
+        processes.append(begin_in_copy(function))
+        return processes[-1]
 
     yield run
     for process in processes:
