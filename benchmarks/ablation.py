@@ -7,9 +7,10 @@
 
 Runs stand in `runs/<experiment>`, where `examples/suite.py` goes on with interrupted ones. Of finished ones
 `benchmarks/results/cpu/<ablation or adaptive>/<variant>/<task>/seed<k>` gets `eval.csv` and `summary.json`. They are
-compared with the preset as it is, by the experiment's own runs of it or those of `cpu_learning.py`, whose evaluations
-have ten episodes; where there is neither it is trained, too. Same settings but for the variant's own, same seed and so
-the same random phase. Writes `README.md` and `differences.png` there.
+compared with the preset as it is: with the experiment's own runs of it, with those of `cpu_learning.py`, whose
+evaluations have ten episodes, or with *mean* of the experiment "adaptive", whose have twenty; where there is none it is
+trained, too. Same settings but for the variant's own, same seed and so the same random phase. Writes `README.md` and
+`differences.png` there.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from torchrl_etdmpc.suites import Experiment, read_experiment
 
 KEPT = {"cpu-ablation": "ablation", "adaptive": "adaptive"}
 """Folder below ``RESULTS`` by the name of the experiment."""
+AS_IT_IS = (".", "adaptive/mean")
+"""Folders below ``RESULTS`` with runs of the preset as it is, whatever the experiment."""
 ENV_STEPS = 50_000
 STEPS = range(10_000, ENV_STEPS + 1, 10_000)
 LEAST_SEEDS = 3
@@ -60,8 +63,8 @@ def collect(runs: Path, folder: Path) -> None:
 
 def partner(folder: Path, base: str, task: str, seed: str) -> Path | None:
     """The run of the preset as it is with the same task and seed, if there is one."""
-    found = (path for path in (folder / base / task / seed, RESULTS / task / seed) if RunDirectory(path).finished)
-    return next(found, None)
+    folders = (path / task / seed for path in (folder / base, *(RESULTS / name for name in AS_IT_IS)))
+    return next((path for path in folders if RunDirectory(path).finished), None)
 
 
 def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
@@ -69,7 +72,7 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
 
     Args:
         folder: of the kept runs.
-        base: the variant that is the preset as it is; its runs are in ``folder`` or else below ``RESULTS``.
+        base: the variant that is the preset as it is; its runs are in ``folder`` or else where :data:`AS_IT_IS` says.
 
     Returns:
         tuple: index ``variant, task, seed``; the returns of both at ``STEPS`` (columns ``variant 50000`` and

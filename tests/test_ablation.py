@@ -145,6 +145,16 @@ def test_a_base_of_the_experiment_s_own_goes_before_the_preset_s_run(script, tmp
     assert table.index("|  | final | 1, 2 | 500 |") < table.index("|  | adaptive beta 0 | 2 | 260 |")
 
 
+def test_the_preset_s_runs_of_the_other_experiment_are_partners_where_there_are_no_others(script, tmp_path):
+    steps, runs = list(script.STEPS), {"seed1": 100.0, "seed4": 300.0}
+    for seed, value in runs.items():
+        write(tmp_path / "adaptive" / "mean" / "walker-run" / seed, dict.fromkeys(steps, value))
+        write(tmp_path / "ablation" / "one head" / "walker-run" / seed, dict.fromkeys(steps, 500.0))
+    write(tmp_path / "walker-run" / "seed1", dict.fromkeys(steps, 200.0))
+    pairs, alone = script.read_pairs(tmp_path / "ablation", "cpu")
+    assert script.last_differences(pairs).tolist() == [300.0, 200.0] and not alone
+
+
 @pytest.mark.parametrize("variant", ["one hed", "mean"])
 def test_a_variant_that_there_is_not_is_refused_before_anything_is_trained(script, monkeypatch, capsys, variant):
     monkeypatch.setattr(script, "train", lambda *arguments: pytest.fail("trains"))
