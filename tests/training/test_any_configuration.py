@@ -1,21 +1,17 @@
-"""Configurations drawn at random: they run a few steps, or are refused in one line."""
+"""Configurations drawn at random: they run a few steps and go on when stopped, or are refused in one line."""
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("dm_control")
 
-from torchrl_etdmpc.envs import make_env  # noqa: E402
-from torchrl_etdmpc.runs import RunDirectory, RunLog  # noqa: E402
-from torchrl_etdmpc.training import TrainConfig, TrainingRun  # noqa: E402
+from torchrl_etdmpc.training import RunInterrupted, TrainConfig  # noqa: E402
 from torchrl_etdmpc.training.config import typed_name  # noqa: E402
 
 
@@ -164,15 +160,19 @@ def names(config: Any) -> set[str]:
     return found
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(values=CONFIGURATIONS, seed=st.integers(0, 2**31))
-def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values: dict[str, Any], seed: int):
-    steps = (values.get("action_repeat") or 2) * (values["replay"]["seed_decisions"] + 6)
+def configuration(values: dict[str, Any], decisions: int) -> TrainConfig:
+    """One that learns for so many decisions."""
+    steps = (values.get("action_repeat") or 2) * (values["replay"]["seed_decisions"] + decisions)
+    return TrainConfig.from_dict(values | FIXED | {"total_env_steps": steps})
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(values=CONFIGURATIONS)
+def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values: dict[str, Any], make_run):
     run_dir = tmp_path_factory.mktemp("runs") / "run"
-    torch.manual_seed(seed)
     try:
-        config = TrainConfig.from_dict(values | FIXED | {"total_env_steps": steps})
-        run = new_run(config, run_dir)
+        config = configuration(values, 6)
+        run = make_run(config, run_dir)
     except ValueError as error:
         assert "\n" not in str(error)
         drawn = {typed_name(name) for name in values} | {
@@ -181,15 +181,42 @@ def test_a_configuration_runs_or_is_refused_in_one_line(tmp_path_factory, values
         assert any(name in str(error) for name in drawn), str(error)
         assert not run_dir.exists()
         return
-    run.log.directory.begin(config.to_dict())
     summary = run.run()  # with warnings as errors
     run.log.directory.close()
-    assert summary["env_steps"] >= steps
+    assert summary["env_steps"] >= config.total_env_steps
     assert (run_dir / "summary.json").exists()
 
 
-def new_run(config: TrainConfig, run_dir: Path) -> TrainingRun:
-    """A run on environments with the configuration's own time limit."""
-    env = make_env(config.task_spec, seed=config.seed, num_envs=config.num_envs, parallel=False)
-    log = RunLog(RunDirectory(run_dir), total_env_steps=config.total_env_steps)
-    return TrainingRun(config, env=env, eval_env=make_env(config.task_spec), log=log)
+CALLS = {
+    "a decision": lambda run: (run.learner.collector, "act"),
+    "an update": lambda run: (run.learner.agent.updater, "step"),
+    "a step of an evaluation": lambda run: (run.evaluator.env, "step_and_maybe_reset"),
+    "a checkpoint": lambda run: (run.checkpoints.store, "save"),
+}
+STOPS = st.lists(st.tuples(st.sampled_from([*CALLS]), st.integers(1, 25)), min_size=1, max_size=3)
+
+
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+@given(values=CONFIGURATIONS, stops=STOPS)
+def test_a_configuration_that_is_stopped_anywhere_ends_as_if_it_had_not_been(
+    tmp_path_factory, values: dict[str, Any], stops: list[tuple[str, int]], straight, make_run, results, stop_at
+):
+    run_dir = tmp_path_factory.mktemp("runs") / "run"
+    try:
+        config = configuration(values, 16)
+        expected = straight(config)
+    except ValueError:
+        reject()
+    run = make_run(config, run_dir)
+    for kind, call in stops:
+        stop_at(run, *CALLS[kind](run), call)
+        try:
+            run.run()
+            break  # it has fewer of these calls
+        except RunInterrupted:
+            run.log.directory.close()
+            run = make_run(config, run_dir, resume=run.env_steps > 0)
+    else:
+        run.run()
+    run.log.directory.close()
+    assert str(results(run, run_dir)) == str(expected)  # as texts, in which a nan is like another
