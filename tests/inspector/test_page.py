@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import shutil
 import socket
@@ -413,6 +414,23 @@ def test_nothing_is_cut_off_on_paper(page, tmp_path):
     assert max(page.driver.execute_script(strips)) <= 0
     assert not page.driver.find_element("id", "iteration").is_displayed()
     assert "3 of 3" in page.text("iteration-value")
+
+
+@pytest.mark.slow
+def test_no_text_of_a_figure_is_cut_off(page, tmp_path):
+    found = expected(0)
+    large = {name: -213 + found[name] / 10 for name in ("scores", "returns", "chosen_returns", "policy_scores")}
+    trace = dataclasses.replace(found, arrays={**found.arrays, **large})  # as of an agent that has learned
+    page.driver.get(write_page(tmp_path / "page", trace).as_uri())
+    wait_for(lambda: shows(page, trace, "a", -1), "the saved plan")
+    script = """return Array.from(document.querySelectorAll('.js-plotly-plot'), graph => {
+        const [outer, texts] = [graph.getBoundingClientRect(), graph.querySelectorAll('.main-svg text')];
+        const within = box => box.left >= outer.left - 1 && box.right <= outer.right + 1;
+        return Array.from(texts).filter(text => !within(text.getBoundingClientRect())).map(text => text.textContent);
+    }).flat()"""
+    drawn = "return document.querySelectorAll('.js-plotly-plot .main-svg text').length"
+    assert page.driver.execute_script(drawn) > 50
+    assert page.driver.execute_script(script) == []
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def mixture_weights(trace: Trace, candidate: int | None = None) -> Drawing:
     """
     weights = trace.get("mixture")
     if weights is None:
-        return plain(empty)("depths have weights of their own with score=adaptive only")
+        return plain(empty)("only score=adaptive weighs the depths")
     if candidate is None:
         rows = np.stack([_mean_of(of, elites) for of, elites in zip(weights, _finite_elites(trace), strict=True)])
     else:

@@ -25,7 +25,7 @@ from torchrl_etdmpc.inspector.trace import Trace
 
 _RING = 9  # pixels
 # Fixed: margins that follow the legend are drawn twice, and where the width changes they are those of the old one.
-_MARGIN = {"l": 60, "r": 85, "t": 30, "b": 125, "autoexpand": False}
+_MARGIN = {"l": 60, "r": 105, "t": 30, "b": 125, "autoexpand": False}
 
 
 @figure_of
