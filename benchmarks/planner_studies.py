@@ -1,6 +1,6 @@
 """What agents of the cpu preset believe of their plans and what is true of it: agents, studies, tables.
 
-    python benchmarks/planner_studies.py                 # trains four agents and studies them: some two hours
+    python benchmarks/planner_studies.py                 # trains four agents and studies them: over an hour
     python benchmarks/planner_studies.py --report-only   # the tables from the committed files
 
 Agents stand in `runs/planner-agents`, where `examples/suite.py` goes on with interrupted ones; the best of each one's
@@ -39,7 +39,7 @@ def train() -> None:
 
 
 def study(task: str, seed: int) -> None:
-    """All studies of one agent but that of the solver, which is about no agent."""
+    """All studies of one agent; that of the solver is about no agent, and not kept."""
     run, out = RunDirectory(RUNS / "cpu" / task / f"seed{seed}"), RUNS / "studies" / f"{task}-seed{seed}"
     agent = [f"checkpoint={run.best_agent.relative_to(ROOT)}", f"episodes={EPISODES}", f"states={STATES}"]
     command = [sys.executable, str(ROOT / "examples" / "study.py"), "all", *agent, f"out={out}"]
