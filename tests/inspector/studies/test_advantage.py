@@ -91,3 +91,18 @@ def test_the_interval_of_a_difference_is_over_episodes():
     result = advantage.Advantage(episode.float(), torch.zeros(40), torch.zeros(40, 2), 1, 2, episode)
     (row,) = advantage.table(result)
     assert (row["low"], row["difference"], row["high"]) == (0.0, 0.5, 1.0)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.1, 0.3, 2.0, 70.0])
+def test_ticks_of_the_differences_do_not_overlap(scale):
+    draws = torch.linspace(-1, 1, 401) * scale
+    earned = draws * (1 + 100 * draws.abs().div(scale).pow(20))  # a few states make all the difference
+    result = advantage.Advantage(earned, torch.zeros(401), torch.randn(401, 4), 1, 2, torch.arange(401))
+    picture = advantage.figure(result)
+    picture.draw_without_rendering()
+    axis = picture.axes[1].yaxis
+    low, high = axis.get_view_interval()
+    extents = [tick.label1.get_window_extent() for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
+    extents.sort(key=lambda extent: extent.y0)
+    assert len(extents) >= 3
+    assert all(below.y1 <= above.y0 for below, above in zip(extents, extents[1:], strict=False))

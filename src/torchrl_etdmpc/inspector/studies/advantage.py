@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -117,7 +118,8 @@ def lines(result: Advantage) -> list[str]:
 def figure(result: Advantage) -> Any:
     """The difference over the first two principal components of the latents, and its distribution.
 
-    The right axis is linear for the smaller three quarters of the differences and logarithmic beyond.
+    The right axis is linear up to the power of ten that three quarters of the differences stay within, and logarithmic
+    beyond.
     """
     from matplotlib.figure import Figure
 
@@ -137,7 +139,8 @@ def figure(result: Advantage) -> Any:
     right.axhline(0, color="black", linewidth=0.8)
     right.axhline(row["difference"], color="#D55E00", label="mean, interval")
     right.axhspan(row["low"], row["high"], color="#D55E00", alpha=0.25, linewidth=0)
-    right.set_yscale("symlog", linthresh=max(float(result.difference.abs().quantile(0.75)), 1e-3))
+    usual = max(float(result.difference.abs().quantile(0.75)), 1e-3)
+    right.set_yscale("symlog", linthresh=10.0 ** math.ceil(math.log10(usual)))  # no tick lies closer to 0
     right.set_xlabel("share of the states")
     right.legend(frameon=False)
     return picture
