@@ -40,6 +40,9 @@ AS_IT_IS = (".", "adaptive/mean")
 """Folders below ``RESULTS`` with runs of the preset as it is, whatever the experiment."""
 ENV_STEPS = 50_000
 STEPS = range(10_000, ENV_STEPS + 1, 10_000)
+COLUMNS = (*map(str, STEPS), "area")
+"""What is compared: returns, and the area under the curve from 0 on as in thesis D.1, by its length."""
+HEADER = " | ".join([*(f"{step:,}" for step in STEPS), "area"])
 LEAST_SEEDS = 3
 """For an interval over seeds: that of two is thirteen times as wide as the two are apart."""
 
@@ -75,8 +78,8 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
         base: the variant that is the preset as it is; its runs are in ``folder`` or else where :data:`AS_IT_IS` says.
 
     Returns:
-        tuple: index ``variant, task, seed``; the returns of both at ``STEPS`` (columns ``variant 50000`` and
-        ``base 50000`` for the last one). And ``variant/task/seed`` of each run without a partner.
+        tuple: index ``variant, task, seed``; ``COLUMNS`` of both (``variant 50000`` and ``base 50000``). And
+        ``variant/task/seed`` of each run without a partner.
     """
     rows, alone = [], []
     for path in sorted(folder.glob("*/*/seed*")):
@@ -89,8 +92,9 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
             continue
         row: dict[str, object] = {"variant": variant, "task": task, "seed": int(seed.removeprefix("seed"))}
         for name, run in (("variant", path), ("base", beside)):
-            returns = read_runs([run]).set_index("env_steps")["return_mean"]
+            returns = read_runs([run]).set_index("env_steps")["return_mean"].loc[[0, *STEPS]]
             row |= {f"{name} {step}": returns[step] for step in STEPS}
+            row[f"{name} area"] = np.trapezoid(returns, returns.index) / ENV_STEPS
         rows.append(row)
     if not rows:
         sys.exit(f"error: no runs under {folder} that the preset has too; run this script without --report-only first.")
@@ -143,6 +147,7 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
         "per task: they say what other tasks of this kind would show. Those of a task are of one difference per seed,",
         "and that of a table's last row is of the seeds of each of its tasks: they say what other seeds would show.",
         f"There is none for fewer than two tasks or {LEAST_SEEDS} seeds.",
+        f"*Area* is that under the curve to {ENV_STEPS:,}, divided by {ENV_STEPS:,}: the mean return on the way.",
         f"{', '.join(TASKS[:-1])} and {TASKS[-1]} are those that the preset was tuned on.",
         "",
         *([f"Left out, because *{experiment.base}* has no run beside them: {', '.join(alone)}.", ""] if alone else []),
@@ -153,14 +158,11 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
         lines += [
             f"## {variant}",
             "",
-            "| mean over tasks | tasks | " + " | ".join(f"{step:,}" for step in STEPS) + " |",
+            f"| mean over tasks | tasks | {HEADER} |",
         ]
-        lines += ["|---|---" + "|---" * len(STEPS) + "|"]
+        lines += ["|---|---" + "|---" * len(COLUMNS) + "|"]
         for name, tasks in groups(by_task.index, experiment.tasks).items():
-            cells = []
-            for step in STEPS:
-                found = by_task.loc[tasks, f"variant {step}"] - by_task.loc[tasks, f"base {step}"]
-                cells.append(written(*interval(found)))
+            cells = [written(*interval(differences(by_task.loc[tasks], column))) for column in COLUMNS]
             lines.append(f"| {name} | {len(tasks)} | {' | '.join(cells)} |")
         lines += ["", *tasks_table(rows, experiment)]
         lines.append("")
@@ -169,35 +171,38 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
 
 def tasks_table(rows: pd.DataFrame, experiment: Experiment) -> list[str]:
     """A variant's tasks at the last step, means over the seeds that are there, and the mean of those with enough."""
-    lines = [f"| task | seeds | {experiment.base} at {ENV_STEPS:,} | variant | difference |", "|---|---|---|---|---|"]
-    returns, differences = rows[[f"base {ENV_STEPS}", f"variant {ENV_STEPS}"]], last_differences(rows)
+    names = f"| task | seeds | {experiment.base} at {ENV_STEPS:,} | variant | difference | difference of areas |"
+    lines = [names, "|---|---|---|---|---|---|"]
+    returns = rows[[f"base {ENV_STEPS}", f"variant {ENV_STEPS}"]]
+    found = [differences(rows, column) for column in (str(ENV_STEPS), "area")]
     for task, seeds in returns.groupby("task"):
         numbers = ", ".join(map(str, sorted(seeds.index.get_level_values("seed"))))
-        cells = [f"{mean:.0f}" for mean in seeds.mean()] + [written(*interval(differences.loc[[task]], LEAST_SEEDS))]
+        cells = [f"{mean:.0f}" for mean in seeds.mean()]
+        cells += [written(*interval(each.loc[[task]], LEAST_SEEDS)) for each in found]
         lines.append(f"| {task} | {numbers} | {' | '.join(cells)} |")
     counts = rows.groupby("task").size()
     enough = [task for task, count in counts.items() if count >= LEAST_SEEDS]
     if len(enough) > 1:
         name = "these tasks" if len(enough) == len(counts) else f"those with {LEAST_SEEDS} seeds or more"
         means = returns.groupby("task").mean().loc[enough].mean()
-        cells = [f"{mean:.0f}" for mean in means] + [written(*interval_over_seeds(differences.loc[enough]))]
+        cells = [f"{mean:.0f}" for mean in means]
+        cells += [written(*interval_over_seeds(each.loc[enough])) for each in found]
         lines.append(f"| {name} |  | {' | '.join(cells)} |")
     return lines
 
 
-def last_differences(rows: pd.DataFrame) -> pd.Series:
-    """The variant's return minus the base's at ``ENV_STEPS``."""
-    return rows[f"variant {ENV_STEPS}"] - rows[f"base {ENV_STEPS}"]
+def differences(rows: pd.DataFrame, column: str) -> pd.Series:
+    """The variant's minus the base's, of one of ``COLUMNS``."""
+    return rows[f"variant {column}"] - rows[f"base {column}"]
 
 
 def returns_table(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
     """Returns by task and variant, means over the seeds that are there."""
-    lines = ["## Returns", "", f"| task | variant | seeds | {' | '.join(f'{step:,}' for step in STEPS)} |"]
-    lines += ["|---|---|---" + "|---" * len(STEPS) + "|"]
+    lines = ["## Returns", "", f"| task | variant | seeds | {HEADER} |", "|---|---|---" + "|---" * len(COLUMNS) + "|"]
     for task, rows in pairs.groupby("task"):
-        bases = rows[[f"base {step}" for step in STEPS]].groupby("seed").first()
+        bases = rows[[f"base {column}" for column in COLUMNS]].groupby("seed").first()
         found = {experiment.base: bases} | {
-            variant: rows.xs(variant, level="variant")[[f"variant {step}" for step in STEPS]].droplevel("task")
+            variant: rows.xs(variant, level="variant")[[f"variant {column}" for column in COLUMNS]].droplevel("task")
             for variant in in_order(rows, experiment)
         }
         for variant, returns in found.items():
@@ -213,25 +218,31 @@ def in_order(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
 
 
 def draw(pairs: pd.DataFrame, experiment: Experiment) -> Figure:
-    """A panel for each variant: the difference on every task and with every seed, and for several tasks their mean."""
+    """A column for each variant: the difference on every task and with every seed, and for several tasks their mean.
+
+    Above of the returns at ``ENV_STEPS``, below of the areas.
+    """
     variants, tasks = in_order(pairs, experiment), sorted(pairs.index.unique("task"), reverse=True)
-    figure = Figure(figsize=(1.6 + 2.6 * len(variants), 0.26 * len(tasks) + 1.5), layout="constrained")
-    axes = figure.subplots(1, len(variants), squeeze=False, sharex=True, sharey=True)[0]
-    for axis, variant in zip(axes, variants, strict=True):
-        found = last_differences(pairs.loc[variant])
-        for task, differences in found.groupby("task"):
-            place = 1 + tasks.index(str(task))
-            axis.plot(differences, [place] * len(differences), "|", color="#0072B2", alpha=0.6)
-            axis.plot(differences.mean(), place, "o", color="#0072B2", fillstyle="none" if task in TASKS else "full")
-        mean, half = interval(found.groupby("task").mean())
-        if not np.isnan(half):
-            axis.errorbar(mean, 0, xerr=half, fmt="D", color="black", capsize=3)
-        axis.axvline(0, color="grey", linewidth=0.8)
-        axis.set_title(textwrap.fill(variant, 26), fontsize=10)
-        axis.grid(axis="x", alpha=0.3)
+    rows = {str(ENV_STEPS): f"return at {ENV_STEPS:,} env steps", "area": "area under the curve"}
+    figure = Figure(figsize=(1.6 + 2.6 * len(variants), 2 * (0.26 * len(tasks) + 1.5)), layout="constrained")
+    grid = figure.subplots(2, len(variants), squeeze=False, sharex="row", sharey=True)
     names = [f"{task} (tuned on)" if task in TASKS else task for task in tasks]
-    axes[0].set_yticks(range(len(tasks) + 1), ["mean, 95% interval", *names])
-    figure.supxlabel(f"return minus that of {experiment.base} at {ENV_STEPS:,} env steps", fontsize=10)
+    for (column, title), axes in zip(rows.items(), grid, strict=True):
+        for axis, variant in zip(axes, variants, strict=True):
+            found = differences(pairs.loc[variant], column)
+            for task, seeds in found.groupby("task"):
+                place = 1 + tasks.index(str(task))
+                axis.plot(seeds, [place] * len(seeds), "|", color="#0072B2", alpha=0.6)
+                axis.plot(seeds.mean(), place, "o", color="#0072B2", fillstyle="none" if task in TASKS else "full")
+            mean, half = interval(found.groupby("task").mean())
+            if not np.isnan(half):
+                axis.errorbar(mean, 0, xerr=half, fmt="D", color="black", capsize=3)
+            axis.axvline(0, color="grey", linewidth=0.8)
+            axis.set_title(textwrap.fill(variant, 26), fontsize=10)
+            axis.grid(axis="x", alpha=0.3)
+            axis.set_xlabel(title, fontsize=9)
+        axes[0].set_yticks(range(len(tasks) + 1), ["mean, 95% interval", *names])
+    figure.supxlabel(f"difference from {experiment.base}", fontsize=10)
     return figure
 
 

@@ -18,6 +18,7 @@ def write(folder: Path, returns: dict[int, float]) -> None:
     folder.mkdir(parents=True)
     task, seed = folder.parent.name, folder.name.removeprefix("seed")
     (folder / "summary.json").write_text(f'{{"task": "{task}", "preset": "cpu", "seed": {seed}}}')
+    returns = {0: next(iter(returns.values()))} | returns
     rows = [f"{step},{step // 2},{step},1.0,{value},1.0,10" for step, value in returns.items()]
     header = "env_steps,decision_steps,updates,wall_time_s,return_mean,return_std,episodes"
     (folder / "eval.csv").write_text("\n".join([header, *rows, ""]))
@@ -36,7 +37,7 @@ def test_runs_are_paired_by_task_and_seed_and_tasks_count_alike(script, tmp_path
     gains = {"walker-run": [10.0, 30.0], "walker-walk": [100.0], "hopper-stand": [0.0]}
     for task, seeds in gains.items():
         for seed, gain in enumerate(seeds, start=1):
-            write(tmp_path / task / f"seed{seed}", dict.fromkeys([0, *steps], 200.0))
+            write(tmp_path / task / f"seed{seed}", dict.fromkeys(steps, 200.0))
             later = {step: 200 + gain * step / steps[-1] for step in [0, *steps]}
             write(tmp_path / "ablation" / "one head" / task / f"seed{seed}", later)
     write(tmp_path / "ablation" / "one head" / "cheetah-run" / "seed1", dict.fromkeys(steps, 900.0))  # has no partner
@@ -44,9 +45,11 @@ def test_runs_are_paired_by_task_and_seed_and_tasks_count_alike(script, tmp_path
     script.main()
     page = (tmp_path / "ablation" / "README.md").read_text()
     # 20, 100 and 0 by task: mean 40, deviation 52.9, Student's t of two degrees of freedom 4.303.
-    assert "| all | 3 | +8 [-18, +34] | +16 [-37, +69] | +24 [-55, +103] | +32 [-73, +137] | +40 [-91, +171] |" in page
-    assert "| tuned on | 1 | +20 | +40 | +60 | +80 | +100 |" in page
-    assert "| walker-run | 1, 2 | 200 | 220 | +20 |" in page
+    assert (
+        "| all | 3 | +8 [-18, +34] | +16 [-37, +69] | +24 [-55, +103] | +32 [-73, +137] | +40 [-91, +171] | +20" in page
+    )
+    assert "| tuned on | 1 | +20 | +40 | +60 | +80 | +100 | +50 |" in page
+    assert "| walker-run | 1, 2 | 200 | 220 | +20 | +10 |" in page
     assert page.count("cheetah-run") == 1
     assert "Left out, because *cpu* has no run beside them: one head/cheetah-run/seed1." in page
     assert (tmp_path / "ablation" / "differences.png").read_bytes().startswith(b"\x89PNG")
@@ -58,7 +61,8 @@ def test_intervals_over_seeds_are_of_a_task_and_of_all_tasks(script, tmp_path, m
     for task, seeds in gains.items():
         for seed, gain in enumerate(seeds, start=1):
             write(tmp_path / task / f"seed{seed}", dict.fromkeys(steps, 200.0))
-            write(tmp_path / "ablation" / "one head" / task / f"seed{seed}", dict.fromkeys(steps, 200 + gain))
+            late = dict.fromkeys(steps, 200.0) | {steps[-1]: 200 + gain}  # a tenth of the gain in the area
+            write(tmp_path / "ablation" / "one head" / task / f"seed{seed}", late)
             if task == "walker-run" and seed < 3:
                 write(tmp_path / "ablation" / "final depth" / task / f"seed{seed}", dict.fromkeys(steps, 200 + gain))
     monkeypatch.setattr(sys, "argv", ["ablation.py", "--report-only"])
@@ -66,11 +70,11 @@ def test_intervals_over_seeds_are_of_a_task_and_of_all_tasks(script, tmp_path, m
     page = (tmp_path / "ablation" / "README.md").read_text()
     # Standard errors 11.5, 40 and 0, Student's t of two degrees of freedom 4.303. Of the three tasks: a standard error
     # of 13.9 and 2.33 degrees of freedom, t 3.768.
-    assert "| walker-run | 1, 2, 3 | 200 | 230 | +30 [-20, +80] |" in page
-    assert "| hopper-stand | 1, 2, 3 | 200 | 240 | +40 [-132, +212] |" in page
-    assert "| walker-walk | 1, 2, 3 | 200 | 207 | +7 [+7, +7] |" in page
-    assert "| these tasks |  | 200 | 226 | +26 [-27, +78] |" in page
-    assert "| walker-run | 1, 2 | 200 | 220 | +20 |" in page
+    assert "| walker-run | 1, 2, 3 | 200 | 230 | +30 [-20, +80] | +3 [-2, +8] |" in page
+    assert "| hopper-stand | 1, 2, 3 | 200 | 240 | +40 [-132, +212] | +4 [-13, +21] |" in page
+    assert "| walker-walk | 1, 2, 3 | 200 | 207 | +7 [+7, +7] | +1 [+1, +1] |" in page
+    assert "| these tasks |  | 200 | 226 | +26 [-27, +78] | +3 [-3, +8] |" in page
+    assert "| walker-run | 1, 2 | 200 | 220 | +20 | +20 |" in page
     assert page.count("these tasks") == 1
 
 
@@ -84,7 +88,7 @@ def test_tasks_with_few_seeds_are_not_in_the_interval_over_seeds(script, tmp_pat
     script.main()
     page = (tmp_path / "ablation" / "README.md").read_text()
     # A standard error of 11.5 / sqrt(2) and four degrees of freedom, t 2.776.
-    assert "| those with 3 seeds or more |  | 0 | 30 | +30 [+7, +53] |" in page
+    assert "| those with 3 seeds or more |  | 0 | 30 | +30 [+7, +53] | +30 [+7, +53] |" in page
 
 
 def test_seeds_that_all_differ_alike_leave_no_doubt(script):
@@ -119,7 +123,7 @@ def test_the_base_is_trained_and_kept_where_it_has_no_run(script, tmp_path, monk
     assert trained == [(["cpu"], ["walker-run"], [4]), (["one head"], ["walker-run"], [1, 4])]
     assert (tmp_path / "ablation" / "cpu" / "walker-run" / "seed4" / "eval.csv").exists()
     page = (tmp_path / "ablation" / "README.md").read_text()
-    assert "| walker-run | 1, 4 | 2 | 2 | +0 |" in page  # 1.5 and 2
+    assert "| walker-run | 1, 4 | 2 | 2 | +0 | +0 |" in page  # 1.5 and 2
 
 
 def test_without_a_pair_there_is_one_line(script, monkeypatch):
@@ -139,9 +143,9 @@ def test_a_base_of_the_experiment_s_own_goes_before_the_preset_s_run(script, tmp
     script.main()
     page = (tmp_path / "adaptive" / "README.md").read_text()
     assert page.startswith("# Does it pay to choose the planning depth?")
-    assert "| walker-run | 1, 2 | 300 | 500 | +200 |" in page  # 400 of its own, 200 of the preset's run
+    assert "| walker-run | 1, 2 | 300 | 500 | +200 | +200 |" in page  # 400 of its own, 200 of the preset's run
     table = page[page.index("## Returns") :]
-    assert "| walker-run | mean | 1, 2 | 300 | 300 | 300 | 300 | 300 |" in table
+    assert "| walker-run | mean | 1, 2 | 300 | 300 | 300 | 300 | 300 | 300 |" in table
     assert table.index("|  | final | 1, 2 | 500 |") < table.index("|  | adaptive beta 0 | 2 | 260 |")
 
 
@@ -152,7 +156,7 @@ def test_the_preset_s_runs_of_the_other_experiment_are_partners_where_there_are_
         write(tmp_path / "ablation" / "one head" / "walker-run" / seed, dict.fromkeys(steps, 500.0))
     write(tmp_path / "walker-run" / "seed1", dict.fromkeys(steps, 200.0))
     pairs, alone = script.read_pairs(tmp_path / "ablation", "cpu")
-    assert script.last_differences(pairs).tolist() == [300.0, 200.0] and not alone
+    assert script.differences(pairs, "50000").tolist() == [300.0, 200.0] and not alone
 
 
 @pytest.mark.parametrize("variant", ["one hed", "mean"])
