@@ -167,3 +167,37 @@ def test_a_variant_that_there_is_not_is_refused_before_anything_is_trained(scrip
         script.main()
     assert "--variants of adaptive are 'final', 'adaptive beta 0'" in (said := capsys.readouterr().err)
     assert f"got {variant!r}." in said
+
+
+@pytest.fixture
+def committed(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    script = importlib.import_module("ablation")
+
+    def read(name: str) -> tuple:
+        folder, experiment = script.RESULTS / script.KEPT[name], script.read_experiment(script.file_of(name))
+        return folder, experiment, *script.read_pairs(folder, experiment.base)
+
+    return script, read
+
+
+@pytest.mark.parametrize("name", ["cpu-ablation", "adaptive"])
+def test_the_committed_tables_are_those_of_the_committed_files(committed, name):
+    script, read = committed
+    folder, experiment, pairs, alone = read(name)
+    assert (folder / "README.md").read_text() == script.report(pairs, experiment, alone)
+
+
+def test_the_study_of_the_adaptive_score_has_the_differences_of_the_committed_files(committed):
+    script, read = committed
+    _, experiment, pairs, _ = read("adaptive")
+    page = (BENCHMARKS.parent / "docs" / "studies" / "planner.md").read_text()
+    for variant in script.in_order(pairs, experiment):
+        rows, cells = pairs.xs(variant, level="variant"), [variant]
+        for column in (str(script.ENV_STEPS), "area"):
+            found = script.differences(rows, column)
+            intervals = [script.interval(found.groupby("task").mean()), script.interval_over_seeds(found)]
+            cells.append(f"{intervals[0][0]:+.0f}")
+            for mean, half in intervals if column != "area" else intervals[1:]:
+                cells.append(f"{mean - half:+.0f} to {mean + half:+.0f}")
+        assert f"| {' | '.join(cells)} |" in page
