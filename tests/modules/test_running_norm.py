@@ -38,6 +38,13 @@ def test_what_is_far_out_is_clipped():
     assert norm(torch.tensor([-1e6])) == -10
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64])
+def test_whole_numbers_are_standardised_to_fractions(dtype):
+    norm, x = RunningNorm(1), torch.tensor([[10], [11], [13]], dtype=dtype)
+    norm.observe(x)
+    torch.testing.assert_close(norm(x), norm(x.float()), rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, 1e30])
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_batch_that_is_not_finite_is_no_batch_also_where_it_is_the_first(wrong, masked):

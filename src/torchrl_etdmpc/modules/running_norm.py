@@ -75,5 +75,6 @@ class RunningNorm(nn.Module):
         self.batches.zero_()
 
     def forward(self, x: Tensor) -> Tensor:
-        """``[..., O] -> [..., O]``."""
-        return ((x - self.mean) * (self.variance + EPSILON).rsqrt()).clamp(-LARGEST, LARGEST).to(x.dtype)
+        """``[..., O] -> [..., O]``, in the dtype of ``x``, or of the statistics where that has no fractions."""
+        standardised = ((x - self.mean) * (self.variance + EPSILON).rsqrt()).clamp(-LARGEST, LARGEST)
+        return standardised.to(x.dtype) if x.is_floating_point() else standardised
