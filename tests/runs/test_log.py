@@ -210,6 +210,17 @@ def test_what_happened_to_the_files_is_undone(tmp_path, log, damage):
     assert after[str(file)] == before[str(file)] + text.splitlines(keepends=True)[-1].encode()
 
 
+def test_a_copy_of_the_run_that_was_made_by_links_gets_no_rows(tmp_path, log):
+    for table in ("train", "eval"):
+        write, copy = getattr(log, f"log_{table}"), tmp_path / f"copy-{table}.csv"
+        write(RESULTS, **COUNTERS)
+        copy.hardlink_to(tmp_path / f"{table}.csv")
+        before = copy.read_bytes()
+        write(RESULTS, **COUNTERS)
+        assert copy.read_bytes() == before
+        assert len(read_csv(tmp_path / f"{table}.csv")) == 3
+
+
 def test_rows_that_somebody_else_wrote_do_not_stay(tmp_path, log):
     log.log_train({"a": 1.0}, **COUNTERS)
     with log.directory.train.open("a") as file:

@@ -200,8 +200,10 @@ class RunLog:
 
     def _write(self, table: Table) -> None:
         file, content, written = self._files[table], self._content[table], self._written[table]
-        size = file.stat().st_size if file.exists() else 0
-        if size != written:  # somebody has changed it
+        status = file.stat() if file.exists() else None
+        size, names = (status.st_size, status.st_nlink) if status else (0, 1)
+        # Somebody has changed it; or it is a file of a copy of the run as well, made by links (cp -al).
+        if size != written or (names > 1 and len(content) > written):
             write_whole(file, content)
         elif len(content) > written:
             try:
