@@ -443,6 +443,17 @@ def test_what_may_be_results_or_somebody_else_s_is_not_taken_over(tmp_path, file
     assert snapshot(directory.path) == before
 
 
+@pytest.mark.parametrize("name", ["last_agent", "best_agent"])
+@pytest.mark.parametrize("env_steps", [0, 50])
+def test_an_agent_that_learned_is_a_result_also_without_tables(tmp_path, name, env_steps):
+    directory = RunDirectory(tmp_path / "run")
+    leave_behind(directory)
+    agent = getattr(directory, name)
+    agent.parent.mkdir()
+    torch.save({"counters": {"env_steps": env_steps}}, agent)
+    assert directory.leftover == (env_steps == 0)
+
+
 def test_an_abandoned_run_leaves_nothing_behind(tmp_path):
     directory = RunDirectory(tmp_path / "runs" / "walker")
     directory.begin(CONFIG)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_etdmpc.runs.files import DamagedFileError, load_yaml, read_whole, write_whole
+from torchrl_etdmpc.runs.files import DamagedFileError, load_tensors, load_yaml, read_whole, write_whole
 
 _CONFIG_BYTES = 2**20
 _SEAL = "# what this run trains with, as it was written: sha256 "
@@ -83,7 +83,9 @@ class RunDirectory:
         # A checkpoint of the same step as the one that is being saved is called .STEP.old for a moment.
         saved = (folder for name in ("[0-9]*", ".*.old") for folder in self.checkpoints.glob(f"resume/{name}"))
         later = any(re.search("[1-9]", folder.name) for folder in saved)
-        return ours and not (os.path.lexists(self.summary) or later or any(map(_has_steps, (self.train, self.eval))))
+        steps = later or any(map(_has_steps, (self.train, self.eval)))
+        agents = self.last_agent, self.best_agent  # without tables, where somebody put them
+        return ours and not (os.path.lexists(self.summary) or steps or any(map(_has_learned, agents)))
 
     @property
     def finished(self) -> bool:
@@ -299,6 +301,16 @@ def _has_steps(table: Path) -> bool:
         return any(int(row["env_steps"]) > 0 for row in rows)
     except (DamagedFileError, ValueError, KeyError, TypeError, csv.Error):
         return True
+
+
+def _has_learned(agent: Path) -> bool:
+    """Whether an agent file is of a later moment than the start; one that cannot be read holds nothing to lose."""
+    if not os.path.lexists(agent):
+        return False
+    try:
+        return load_tensors(read_whole(agent), agent)["counters"]["env_steps"] > 0
+    except (DamagedFileError, KeyError, TypeError):
+        return False
 
 
 def _to_yaml(config: Mapping[str, Any]) -> str:
