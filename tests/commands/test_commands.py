@@ -37,6 +37,17 @@ def test_a_folder_of_any_alphabet_can_be_named_where_output_is_ascii(monkeypatch
     assert written.getvalue().endswith(b"runs/gr\\xf6\\xdfe\n")
 
 
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_a_stream_that_is_closed_takes_what_is_written(monkeypatch, name):
+    monkeypatch.setattr(sys, name, None)  # as Python does, of `command >&-`
+    monkeypatch.setattr(sys, "argv", ["/bin/torchrl-etdmpc", "--version"])
+    with pytest.raises(SystemExit):
+        commands.main()
+    print("10 env steps", file=getattr(sys, name), flush=True)
+    assert not getattr(sys, name).isatty()
+    getattr(sys, name).close()
+
+
 def test_the_wheel_holds_every_file_that_the_package_reads():
     package = ROOT / "src" / "torchrl_etdmpc"
     patterns = PROJECT["tool"]["setuptools"]["package-data"]["torchrl_etdmpc"]

@@ -43,6 +43,9 @@ def main(command: str | None = None) -> None:
     ...     main()
     torchrl-etdmpc ...
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who began this process: a file of the run would take its place
+            setattr(sys, name, open(os.devnull, "w"))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # the last line of a run may name a folder in any alphabet
     if command is None:
