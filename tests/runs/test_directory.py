@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -266,6 +267,36 @@ def test_a_run_that_began_between_the_look_and_the_lock_is_not_overwritten(tmp_p
         directory.begin(CONFIG)
     assert directory.read_config()["seed"] == 2
     assert elsewhere(lambda: RunDirectory(directory.path).go_on()) is None  # and nobody is kept out
+
+
+@pytest.mark.parametrize("how", ["moved", "removed", "unlocked"])
+def test_a_run_that_began_where_another_one_was_moved_or_removed_is_not_touched(begun, elsewhere, how):
+    """The other one is still there, and does not know."""
+    begun.require_held()
+    if how == "unlocked":
+        begun.lock.unlink()
+        begun.require_held()  # nobody has taken its place
+    elif how == "removed":
+        shutil.rmtree(begun.path)
+    else:
+        begun.path.rename(begun.path.with_name("elsewhere"))
+    if how != "unlocked":
+        with pytest.raises(OSError, match=r"run was moved or removed while a run trained in it, or its \.lock was; "):
+            begun.require_held()
+
+    def begin_and_die() -> None:
+        other = RunDirectory(begun.path)
+        other.begin(CONFIG | {"seed": 2})
+        other.eval.write_text(ROW.format(0))
+        os._exit(0)
+
+    assert elsewhere(begin_and_die) is None
+    before, lock = snapshot(begun.path), begun.lock.stat()
+    with pytest.raises(OSError, match="was moved or removed"):
+        begun.require_held()
+    begun.abandon()
+    assert snapshot(begun.path) == before
+    assert os.path.samestat(begun.lock.stat(), lock)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")

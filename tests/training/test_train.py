@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import shutil
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -86,6 +87,25 @@ def test_an_evaluation_due_at_the_end_of_the_seed_phase_is_of_the_pretrained_age
     make_run(tiny_config(eval_every=60, total_env_steps=70), tmp_path).run()
     rows = read_table(tmp_path / "eval.csv")
     assert [(row["env_steps"], row["updates"]) for row in rows] == [(0, 0), (60, 7), (70, 7 + 2 * 5)]
+
+
+@pytest.mark.parametrize("during", ["evaluation", "row", "checkpoint"])
+def test_a_run_whose_directory_is_removed_ends_and_writes_nothing_there(
+    tmp_path, monkeypatch, tiny_config, make_run, during
+):
+    run = make_run(tiny_config(total_env_steps=80, replay={"pretrain_updates": 0}), tmp_path / "run")
+    owner: Any = {"evaluation": Evaluator, "row": run, "checkpoint": run.checkpoints}[during]
+    method = {"evaluation": "__call__", "row": "write_row", "checkpoint": "save"}[during]
+    original = getattr(owner, method)
+
+    def removed(*args: Any, **kwargs: Any) -> Any:
+        shutil.rmtree(tmp_path / "run")
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, method, removed)
+    with pytest.raises(OSError, match=r"^run_dir=.*run was moved or removed while a run trained in it"):
+        run.run()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_training_does_not_depend_on_how_often_it_is_evaluated(tmp_path, tiny_config, make_run):

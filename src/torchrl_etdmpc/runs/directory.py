@@ -63,6 +63,7 @@ class RunDirectory:
         self.wandb_id = self.path / "wandb_id"
         self.lock = self.path / ".lock"
         self._unlock: weakref.finalize | None = None
+        self._locked = -1  # descriptor of the lock, while there is one
         self._made: list[Path] = []  # folders, the outermost first
 
     def __str__(self) -> str:
@@ -199,15 +200,37 @@ class RunDirectory:
 
     def abandon(self) -> None:
         """Forgets a run that made no step: its files go, and the folders that were made for it."""
-        self._remove_files()
+        if not self._is_lost():
+            self._remove_files()
         self.close()
         self._remove_folders()
+
+    def require_held(self) -> None:
+        """Raises OSError if the directory was moved or removed since it was locked, or is another process's now.
+
+        To be asked before something is written into it, which would change the files of a run that began there since.
+        """
+        if self._is_lost():
+            raise OSError(
+                f"run_dir={self} was moved or removed while a run trained in it, or its {self.lock.name} was; so the "
+                "run ends, and changes nothing of what is there now. Where its files are, it goes on with resume=true."
+            )
 
     def close(self) -> None:
         """Lets other processes in, and leaves no lock behind."""
         if self._unlock is not None:
             self._unlock()
             self._unlock = None
+
+    def _is_lost(self) -> bool:
+        if self._unlock is None:
+            return False
+        try:
+            return not os.path.samestat(os.stat(self.lock), os.fstat(self._locked))
+        except FileNotFoundError:
+            return not self.path.exists()
+        except OSError:  # a file system that does not answer now
+            return False
 
     def _remove_files(self) -> None:
         for file in (self.train, self.eval, self.curve, self.wandb_id):
@@ -282,13 +305,16 @@ class RunDirectory:
                 return
             if os.fstat(descriptor).st_nlink:
                 self._unlock = weakref.finalize(self, _unlock, self.lock, descriptor)
+                self._locked = descriptor
                 self._remove_partial_files()
             else:  # its owner has unlocked and removed it since it was opened
                 os.close(descriptor)
 
 
 def _unlock(lock: Path, descriptor: int) -> None:
-    lock.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        if os.path.samestat(os.stat(lock), os.fstat(descriptor)):  # otherwise it is another process's
+            lock.unlink()
     os.close(descriptor)
 
 

@@ -61,6 +61,7 @@ class RunCheckpoints:
     ) -> None:
         self.config, self.learner, self.best, self.parts = config, learner, best, parts
         self.store = CheckpointStore(directory.checkpoints, keep=config.checkpoint_keep)
+        self._directory = directory
         self._links = {directory.last_agent: "agent"}
         self._agents = directory.last_agent, directory.best_agent
         self._saved_at, self._saved_step = time.perf_counter(), -1
@@ -78,8 +79,10 @@ class RunCheckpoints:
             bool: whether it was written.
 
         Raises:
-            OSError: if the first one cannot be: there would be nothing to go on from, and nothing is lost yet.
+            OSError: if the first one cannot be: there would be nothing to go on from, and nothing is lost yet. Or if
+                the directory is not this run's any more.
         """
+        self._directory.require_held()
         try:
             self._write()
         except OSError as error:

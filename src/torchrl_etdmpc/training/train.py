@@ -117,7 +117,8 @@ class TrainingRun:
 
         Raises:
             RunInterrupted: if a signal asked the run to stop; it is saved.
-            OSError: if the end cannot be saved: then the run is not finished, and goes on when there is room.
+            OSError: if the end cannot be saved: then the run is not finished, and goes on when there is room. Or if the
+                directory is not this run's any more.
             NonFiniteError, SimulatorError: if environment, policy or updates keep failing; the run is saved first.
         """
         try:
@@ -258,6 +259,7 @@ class TrainingRun:
             )
             self.state.eval_returns.append(math.nan)
             return
+        self.log.directory.require_held()  # an evaluation takes minutes
         self.state.eval_returns.append(result.return_mean)
         self.best.note(result.return_mean)
         row = {name: value for name, value in result._asdict().items() if value is not None}
@@ -269,6 +271,7 @@ class TrainingRun:
 
     def write_row(self) -> None:
         """Appends a row to ``train.csv``: means over the interval, and counts since the run began."""
+        self.log.directory.require_held()
         self.log.log_train(self.learner.pop_row(), **self.counters())
 
     def summary(self) -> dict[str, Any]:
