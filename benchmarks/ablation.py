@@ -38,6 +38,8 @@ KEPT = {"cpu-ablation": "ablation", "adaptive": "adaptive"}
 """Folder below ``RESULTS`` by the name of the experiment."""
 AS_IT_IS = (".", "adaptive/mean")
 """Folders below ``RESULTS`` with runs of the preset as it is, whatever the experiment."""
+ALIKE = {"ablation/final depth": "adaptive/final"}
+"""Variants with the settings of another experiment's, below ``RESULTS``: its runs stand for those that are missing."""
 ENV_STEPS = 50_000
 STEPS = range(10_000, ENV_STEPS + 1, 10_000)
 COLUMNS = (*map(str, STEPS), "area")
@@ -82,8 +84,12 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
         ``variant/task/seed`` of each run without a partner.
     """
     rows, alone = [], []
-    for path in sorted(folder.glob("*/*/seed*")):
-        variant, task, seed = path.parts[-3:]
+    runs = {path.parts[-3:]: path for path in folder.glob("*/*/seed*")}
+    for name, other in ALIKE.items():
+        kept, variant = name.split("/")
+        found = (RESULTS / other).glob("*/seed*") if kept == folder.name else ()
+        runs = {(variant, *path.parts[-2:]): path for path in found} | runs
+    for (variant, task, seed), path in sorted(runs.items()):
         if variant == base:
             continue
         beside = partner(folder, base, task, seed)

@@ -159,6 +159,20 @@ def test_the_preset_s_runs_of_the_other_experiment_are_partners_where_there_are_
     assert script.differences(pairs, "50000").tolist() == [300.0, 200.0] and not alone
 
 
+def test_runs_of_a_variant_with_the_same_settings_stand_for_missing_ones(script, tmp_path):
+    steps = list(script.STEPS)
+    for seed in ("seed1", "seed2"):
+        write(tmp_path / "walker-run" / seed, dict.fromkeys(steps, 200.0))
+        write(tmp_path / "adaptive" / "final" / "walker-run" / seed, dict.fromkeys(steps, 300.0))
+    write(tmp_path / "ablation" / "final depth" / "walker-run" / "seed2", dict.fromkeys(steps, 250.0))
+    pairs, alone = script.read_pairs(tmp_path / "ablation", "cpu")
+    assert script.differences(pairs, "50000").to_dict() == {
+        ("final depth", "walker-run", 1): 100.0,
+        ("final depth", "walker-run", 2): 50.0,
+    }
+    assert not alone
+
+
 @pytest.mark.parametrize("variant", ["one hed", "mean"])
 def test_a_variant_that_there_is_not_is_refused_before_anything_is_trained(script, monkeypatch, capsys, variant):
     monkeypatch.setattr(script, "train", lambda *arguments: pytest.fail("trains"))
@@ -201,3 +215,22 @@ def test_the_study_of_the_adaptive_score_has_the_differences_of_the_committed_fi
             for mean, half in intervals if column != "area" else intervals[1:]:
                 cells.append(f"{mean - half:+.0f} to {mean + half:+.0f}")
         assert f"| {' | '.join(cells)} |" in page
+
+
+def test_the_study_of_the_ablation_has_the_areas_of_the_committed_files(committed):
+    script, read = committed
+    _, experiment, pairs, _ = read("cpu-ablation")
+    page = (BENCHMARKS.parent / "docs" / "studies" / "ablation.md").read_text()
+    found = 0
+    for variant in script.in_order(pairs, experiment):
+        rows = pairs.xs(variant, level="variant")
+        if "walker-run" in rows.index.get_level_values("task"):
+            rows = rows.loc["walker-run"]
+            each = script.differences(rows, "area")
+            cells = [variant, ", ".join(map(str, rows.index))]
+            cells += [", ".join(f"{area:.0f}" for area in rows["variant area"])]
+            cells += [", ".join(f"{area:+.0f}" for area in each)]
+            cells += [script.written(*script.interval(each, script.LEAST_SEEDS))]
+            assert f"| {' | '.join(cells)} |" in page
+            found += 1
+    assert found == 5

@@ -257,3 +257,15 @@ def test_the_study_of_adaptive_horizons_varies_the_score_and_beta_alone():
         "adaptive beta 3": {"planner.score": "adaptive", "planner.beta": 3.0},
         "adaptive beta 10": {"planner.score": "adaptive", "planner.beta": 10.0},
     }
+
+
+def test_the_last_depth_is_scored_alike_in_both_studies():
+    """benchmarks/ablation.py takes runs of one for those of the other."""
+    alike = (
+        (read_experiment(STUDIES / "cpu-ablation.yaml"), "final depth"),
+        (read_experiment(STUDIES / "adaptive.yaml"), "final"),
+    )
+    one, other = (flat(experiment.config(variant, "walker-run", 1).to_dict()) for experiment, variant in alike)
+    assert {key: (value, other[key]) for key, value in one.items() if value != other[key]} == {
+        "eval_episodes": (10, 20)
+    }
