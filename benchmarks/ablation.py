@@ -45,8 +45,8 @@ STEPS = range(10_000, ENV_STEPS + 1, 10_000)
 COLUMNS = (*map(str, STEPS), "area")
 """What is compared: returns, and the area under the curve from 0 on as in thesis D.1, by its length."""
 HEADER = " | ".join([*(f"{step:,}" for step in STEPS), "area"])
-LEAST_SEEDS = 3
-"""For an interval over seeds: that of two is thirteen times as wide as the two are apart."""
+LEAST = 3
+"""Tasks or seeds for an interval: that of two is thirteen times as wide as the two are apart."""
 
 
 def file_of(name: str) -> Path:
@@ -107,10 +107,10 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
     return pd.DataFrame(rows).set_index(["variant", "task", "seed"]), alone
 
 
-def interval(differences: pd.Series, least: int = 2) -> tuple[float, float]:
-    """Mean and half of its 95% interval (Student's t; NaN for fewer than ``least`` differences)."""
+def interval(differences: pd.Series) -> tuple[float, float]:
+    """Mean and half of its 95% interval (Student's t; NaN for fewer than ``LEAST`` differences)."""
     count = len(differences)
-    if count < least:
+    if count < LEAST:
         return differences.mean(), float("nan")
     return differences.mean(), student.ppf(0.975, count - 1) * differences.std() / count**0.5
 
@@ -152,7 +152,7 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
         "above 0 the variant is ahead. In brackets 95% intervals (Student's t). Those over tasks are of one difference",
         "per task: they say what other tasks of this kind would show. Those of a task are of one difference per seed,",
         "and that of a table's last row is of the seeds of each of its tasks: they say what other seeds would show.",
-        f"There is none for fewer than two tasks or {LEAST_SEEDS} seeds.",
+        f"There is none for fewer than {LEAST} tasks or seeds.",
         f"*Area* is that under the curve to {ENV_STEPS:,}, divided by {ENV_STEPS:,}: the mean return on the way.",
         f"{', '.join(TASKS[:-1])} and {TASKS[-1]} are those that the preset was tuned on.",
         "",
@@ -184,12 +184,12 @@ def tasks_table(rows: pd.DataFrame, experiment: Experiment) -> list[str]:
     for task, seeds in returns.groupby("task"):
         numbers = ", ".join(map(str, sorted(seeds.index.get_level_values("seed"))))
         cells = [f"{mean:.0f}" for mean in seeds.mean()]
-        cells += [written(*interval(each.loc[[task]], LEAST_SEEDS)) for each in found]
+        cells += [written(*interval(each.loc[[task]])) for each in found]
         lines.append(f"| {task} | {numbers} | {' | '.join(cells)} |")
     counts = rows.groupby("task").size()
-    enough = [task for task, count in counts.items() if count >= LEAST_SEEDS]
+    enough = [task for task, count in counts.items() if count >= LEAST]
     if len(enough) > 1:
-        name = "these tasks" if len(enough) == len(counts) else f"those with {LEAST_SEEDS} seeds or more"
+        name = "these tasks" if len(enough) == len(counts) else f"those with {LEAST} seeds or more"
         means = returns.groupby("task").mean().loc[enough].mean()
         cells = [f"{mean:.0f}" for mean in means]
         cells += [written(*interval_over_seeds(each.loc[enough])) for each in found]

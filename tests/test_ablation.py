@@ -230,7 +230,7 @@ def test_the_study_of_the_ablation_has_the_areas_of_the_committed_files(committe
             cells = [variant, ", ".join(map(str, rows.index))]
             cells += [", ".join(f"{area:.0f}" for area in rows["variant area"])]
             cells += [", ".join(f"{area:+.0f}" for area in each)]
-            cells += [script.written(*script.interval(each, script.LEAST_SEEDS))]
+            cells += [script.written(*script.interval(each))]
             assert f"| {' | '.join(cells)} |" in page
             found += 1
     assert found == 5
