@@ -89,6 +89,34 @@ def test_the_compiled_loss_equals_the_eager_one_in_numbers_gradients_and_scale(
         assert_same_gradients(actual, expected)
 
 
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.parametrize("kind", ["whole", "model", "value", "policy", "action values"])
+def test_a_loss_that_is_compiled_by_its_user_is_compiled_once(make_loss, slices, total, kind):
+    graphs = []
+
+    def keep(graph, inputs):
+        graphs.append(graph)
+        return graph.forward
+
+    if kind == "action values":
+        sizes = {"latent_dim": 16, "mlp_dim": 12, "encoder_dim": 10}
+        dims = (slices["observation"].shape[-1], slices["action"].shape[-1])
+        loss = TDMPC2Loss(ActionValueWorldModel(*dims, **sizes), discount=0.9)
+    else:
+        loss = make_loss(kind)
+    has_targets = any(name.startswith("target_") for name, _ in loss.named_buffers())
+    optimizer, targets = torch.optim.SGD(loss.parameters()), SoftUpdate(loss, tau=0.1) if has_targets else None
+    torch.compiler.reset()
+    compiled = torch.compile(loss, fullgraph=True, backend=keep)
+    for _ in range(3):
+        total(compiled(slices)).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        if targets is not None:
+            targets.step()
+    assert len(graphs) == 1
+
+
 @pytest.mark.parametrize("kind", [torch.float32, torch.int64, torch.uint8])
 @pytest.mark.parametrize("replayed", [0.0, 0.5])
 def test_flags_of_other_kinds_count_as_flags(

@@ -236,9 +236,8 @@ class LatentRolloutLoss(SharedNetworksLoss):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that ``forward`` reads."""
-        if self._in_keys is None:
-            self._in_keys = list(self._reads().values())
-        return self._in_keys
+        # Not kept: what the first call would note here, torch.compile would compile the second one anew for.
+        return list(self._reads().values()) if self._in_keys is None else self._in_keys
 
     @in_keys.setter
     def in_keys(self, keys: list[NestedKey]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
