@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
 from pathlib import Path
 from typing import BinaryIO
@@ -155,11 +156,12 @@ def test_the_same_data_gives_the_same_files_and_a_report_replaces_an_old_one(rep
 
 
 @pytest.mark.parametrize("which", [1, 3])
-def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_it(monkeypatch, tmp_path, which):
+def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_it(
+    without_figures, monkeypatch, tmp_path, which
+):
     out = tmp_path / "report"
-    out.mkdir()
-    for name in FILES:
-        (out / name).write_text("old")
+    write_report(comparison(height=3.0), out)
+    old = contents(out)
     calls = []
 
     def save(figure, file, **options):
@@ -171,7 +173,7 @@ def test_a_figure_that_fails_leaves_the_old_report_as_it_was_and_nothing_beside_
     monkeypatch.setattr(Figure, "savefig", save)
     with pytest.raises(RuntimeError, match="no figure today"):
         write_report(comparison(), out)
-    assert contents(out) == dict.fromkeys(FILES, b"old")
+    assert contents(out) == old
     assert [path.name for path in tmp_path.iterdir()] == ["report"]
 
 
@@ -239,17 +241,40 @@ def test_without_an_area_on_all_tasks_there_is_no_figure_of_areas(without_figure
         budget=60_000,
         grid_step=10_000,
     )
-    (tmp_path / "auc.png").write_text("of an earlier report")
+    write_report(comparison(), tmp_path)
     page = write_report(found, tmp_path).read_text(encoding="utf-8")
     assert set(contents(tmp_path)) == FILES - {"auc.png"}
     assert "(aggregate.png)" in page and "(auc.png)" not in page
 
 
 def test_a_table_of_an_older_report_that_this_one_lacks_is_gone(without_figures, tmp_path):
+    write_report(comparison(), tmp_path, vector="svg")
     for name in ("paired.csv", "mine.csv"):
         (tmp_path / name).write_text("of other runs")
     write_report(comparison(), tmp_path)
+    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".md", ".png"}
     assert {path.name for path in tmp_path.glob("*.csv")} == {"auc.csv", "final.csv", "returns.csv", "mine.csv"}
+
+
+@pytest.mark.parametrize("name", ["returns.csv", "curves.svg", "index.md"])
+def test_a_folder_with_such_files_of_something_else_is_refused_and_stays_as_it_was(without_figures, tmp_path, name):
+    (tmp_path / name).write_text("of a paper")
+    with pytest.raises(ValueError, match=rf"holds {re.escape(name)} of something other than a report"):
+        write_report(comparison(), tmp_path)
+    assert contents(tmp_path) == {name: b"of a paper"}
+
+
+def test_the_page_is_there_before_any_other_file_so_that_what_a_kill_leaves_is_a_report(without_figures, tmp_path):
+    moved, move = [], os.replace
+
+    def note(source: Path, target: Path) -> None:
+        moved.append(target)
+        move(source, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "replace", note)
+        write_report(comparison(), tmp_path)
+    assert Path(moved[0]).name == "index.md" and len(moved) == len(FILES)
 
 
 def test_methods_known_per_seed_on_all_tasks_have_an_interquartile_mean_on_the_page(without_figures, tmp_path):

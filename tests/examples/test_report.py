@@ -549,6 +549,18 @@ def test_a_file_in_the_place_of_the_report_is_named(monkeypatch, tmp_path, refus
     assert refused("runs", "--out", "notes.txt") == "--out=notes.txt is a file; name a folder."
 
 
+@pytest.mark.parametrize("watch", [(), ("--watch",)])
+def test_a_folder_with_files_that_a_report_would_replace_or_remove_is_named(refused, watch):
+    make_run("runs/a")
+    Path("paper").mkdir()
+    Path("paper", "curves.svg").write_text("mine")
+    assert refused("runs", "--out", "paper", *watch) == (
+        "paper holds curves.svg of something other than a report, which would be lost; choose a folder of its own for "
+        "the report."
+    )
+    assert Path("paper", "curves.svg").read_text() == "mine"
+
+
 def test_a_report_that_cannot_be_written_is_named(refused):
     make_run("runs/a")
     assert refused("runs", "--out", "/proc/report") == (

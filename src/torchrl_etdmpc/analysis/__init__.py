@@ -33,7 +33,7 @@ from torchrl_etdmpc.analysis.curves import join_curves, read_curves, read_points
 from torchrl_etdmpc.analysis.experiment import Experiment, experiment_root, incomplete_runs, read_experiment
 from torchrl_etdmpc.analysis.figures import method_styles, plot_aggregate, plot_auc, plot_curves, plot_run
 from torchrl_etdmpc.analysis.paired import compare_paired
-from torchrl_etdmpc.analysis.report import write_report
+from torchrl_etdmpc.analysis.report import require_report_folder, write_report
 from torchrl_etdmpc.analysis.robust import Interval, interquartile_mean, probability_of_improvement, scores_at
 from torchrl_etdmpc.analysis.runs import Run, find_runs, join_runs, mixed_settings, read_run, read_runs
 from torchrl_etdmpc.analysis.statistics import (
@@ -101,6 +101,7 @@ __all__ = [
     "read_points",
     "read_run",
     "read_runs",
+    "require_report_folder",
     "result_table",
     "returns_at",
     "scores_at",

@@ -31,8 +31,37 @@ from torchrl_etdmpc.analysis.steps import MEAN, overview, step_table
 from torchrl_etdmpc.analysis.tables import AGGREGATE, DASH, escape, result_table, to_csv, to_markdown
 from torchrl_etdmpc.runs.files import replacing
 
+PAGE = "index.md"
+TABLES = ("auc.csv", "auc.md", "final.csv", "final.md", "returns.csv", "paired.csv")
+"""The last two only where the comparison has such rows."""
 FIGURES = ("curves", "aggregate", "auc")
 """The last two only where something normalises the tasks, the last one where a method has an area on all of them."""
+_FORMATS = ("png", "pdf", "svg")
+_GRID = "Evaluation grid of the AUC"
+"""On the page of every report, by which its folder is known."""
+
+
+def require_report_folder(out: str | os.PathLike[str]) -> None:
+    """Refuses a folder where a report would replace or remove what no report has written.
+
+    Args:
+        out (path): where a report is to be; it need not exist.
+
+    Raises:
+        ValueError: if files there have names of a report's, and there is no page of a report beside them.
+
+    >>> require_report_folder("a folder that is not there")
+    """
+    out = Path(out)
+    page = out / PAGE
+    if page.is_file() and _GRID in page.read_text(encoding="utf-8", errors="replace"):
+        return
+    found = [name for name in (PAGE, *TABLES, *_figure_files()) if os.path.lexists(out / name)]
+    if found:
+        raise ValueError(
+            f"{out} holds {', '.join(found)} of something other than a report, which would be lost; choose a folder of "
+            "its own for the report."
+        )
 
 
 def write_report(
@@ -47,7 +76,7 @@ def write_report(
     ``returns.csv`` (at fixed steps) and ``paired.csv`` are there where the comparison has such rows.
 
     Every file is written beside its name first and all are moved into place at the end, so that an error leaves the old
-    report as it was.
+    report as it was. What an older report had and this one has not is removed.
 
     Args:
         comparison (Comparison): see :func:`compare`.
@@ -69,25 +98,26 @@ def write_report(
     ('index.md', ['aggregate.png', 'auc.png', 'curves.png'])
     """
     out = Path(out)
+    require_report_folder(out)
     files = _tables(comparison)
     with matplotlib.rc_context({"text.parse_math": False}):  # a name may hold any sign
         figures = _figures(comparison)
-    files["index.md"] = _page(comparison, files, figures, incomplete)
     contents = {name: text.encode() for name, text in files.items()}
     for name, figure in figures.items():
         for ending in filter(None, ("png", vector)):
             contents[f"{name}.{ending}"] = _picture(figure, name, ending)
+    contents[PAGE] = _page(comparison, files, figures, incomplete).encode()
     out.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:  # which moves the last one first: no part of a report is without its page
         for name, content in contents.items():
             stack.enter_context(replacing(out / name)).write_bytes(content)
-    for name in {"returns.csv", "paired.csv"} - set(contents):  # of an earlier report, of other data
+    for name in {*TABLES, *_figure_files()} - set(contents):  # of an earlier report, of other data
         (out / name).unlink(missing_ok=True)
-    for name in FIGURES:
-        for ending in ("png", "pdf", "svg"):
-            if f"{name}.{ending}" not in contents:
-                (out / f"{name}.{ending}").unlink(missing_ok=True)
-    return out / "index.md"
+    return out / PAGE
+
+
+def _figure_files() -> list[str]:
+    return [f"{name}.{ending}" for name in FIGURES for ending in _FORMATS]
 
 
 def _picture(figure: Figure, name: str, ending: str) -> bytes:
@@ -169,7 +199,7 @@ def _page(comparison: Comparison, files: dict[str, str], figures: Collection[str
         normalised = f"Normalised by {by}. "
     parts = [
         f"# {benchmark.title}: {', '.join(comparison.methods)}\n",
-        f"Budget {comparison.budget:,} environment steps; {scope}. Evaluation grid of the AUC: {grid[0]:,.0f} to "
+        f"Budget {comparison.budget:,} environment steps; {scope}. {_GRID}: {grid[0]:,.0f} to "
         f"{grid[-1]:,.0f} every {grid[1] - grid[0]:,.0f} env steps, trapezoid rule, env steps in millions. "
         + normalised
         + "In brackets: number of seeds of each figure. Best in bold, second best in italics. "

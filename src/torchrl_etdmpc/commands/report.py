@@ -99,9 +99,10 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     """Writes the report, once or again and again."""
     arguments = parse()
-    from torchrl_etdmpc.analysis import read_curves, read_points
+    from torchrl_etdmpc.analysis import read_curves, read_points, require_report_folder
     from torchrl_etdmpc.commands.report_runs import report, stamp
 
+    require_report_folder(Path(arguments.out).expanduser())
     references = [(file, read_curves(file)) for file in arguments.reference]
     points = [(file, read_points(file)) for file in arguments.points]
     if arguments.watch is None:
