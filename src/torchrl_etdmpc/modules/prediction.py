@@ -15,7 +15,8 @@ class PredictionModel(Protocol):
     without an ensemble has ``num_dynamics = 1`` and a last dimension of size 1 in ``values``. Every method takes any
     leading batch ``...``, on the device and in the dtype of its input, and none of them draws random numbers.
     :class:`~torchrl_etdmpc.modules.WorldModel` is the learned one; :mod:`torchrl_etdmpc.testing` has exact ones, which
-    are short to read. The losses train the networks of a ``WorldModel`` and need more than this.
+    are short to read. The losses train the networks of a ``WorldModel`` and need more than this. A model has these
+    members and does not derive from this class, whose own do nothing.
 
     A model with a policy has ``policy`` and ``act`` as well (:class:`PolicyModel`), from which the planner takes its
     proposals; without one it is driven with ``num_proposals=0``.
@@ -27,17 +28,31 @@ class PredictionModel(Protocol):
     >>> require_prediction_model(LineWorld())
     """
 
-    observation_dim: int | None
-    """O, size of the flat observation. ``None``: the model encodes what it likes, e.g. images or a dictionary."""
-    action_dim: int
-    """A; every action lies in [-1, 1]."""
-    latent_dim: int
-    """L, size of the state in which everything is predicted."""
-    num_dynamics: int
-    """F, dynamics heads."""
-    version: Tensor
-    """How many updates made these weights: a scalar, int64. It is stamped on every target; a model that is not trained
-    has a zero."""
+    # Properties, since nobody but the model sets them: to a type checker an int is then an int | None.
+    @property
+    def observation_dim(self) -> int | None:
+        """O, size of the flat observation. ``None``: the model encodes what it likes, e.g. images or a dictionary."""
+        ...
+
+    @property
+    def action_dim(self) -> int:
+        """A; every action lies in [-1, 1]."""
+        ...
+
+    @property
+    def latent_dim(self) -> int:
+        """L, size of the state in which everything is predicted."""
+        ...
+
+    @property
+    def num_dynamics(self) -> int:
+        """F, dynamics heads."""
+        ...
+
+    @property
+    def version(self) -> Tensor:
+        """How many updates made these weights: a scalar, int64, stamped on every target; zero without training."""
+        ...
 
     def encode(self, observation: Any) -> Tensor:
         """Observation ``[..., O]`` to latent ``[..., L]``.
@@ -112,8 +127,10 @@ class ActionValueModel(PolicyModel, Protocol):
     (True, False)
     """
 
-    num_values: int
-    """V, action-value heads."""
+    @property
+    def num_values(self) -> int:
+        """V, action-value heads."""
+        ...
 
     def action_values(self, latent: Tensor, action: Tensor) -> Tensor:
         """Expected discounted return of ``action [..., A]`` in ``latent [..., L]`` by each head, ``[..., V]``."""
@@ -166,7 +183,7 @@ def require_prediction_model(model: object) -> None:
     >>> from torchrl_etdmpc.modules import WorldModel
     >>> require_prediction_model(WorldModel(3, 2, latent_dim=16, mlp_dim=32))
     """
-    members = [*PredictionModel.__annotations__, *(name for name in vars(PredictionModel) if not name.startswith("_"))]
+    members = [name for name in vars(PredictionModel) if not name.startswith("_")]
     members += _POLICY if has_policy(model) else ()
     members += (*_POLICY, "num_values") if has_action_values(model) else ()
     # None says something as observation_dim alone.

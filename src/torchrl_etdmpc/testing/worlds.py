@@ -6,10 +6,15 @@ score of one's own can be held against the optimum.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
 from torchrl_etdmpc.functional import bounded_log_std, clipped_sample
+
+if TYPE_CHECKING:
+    from torchrl_etdmpc.modules import PredictionModel
 
 
 class AnalyticWorld(nn.Module):
@@ -130,6 +135,10 @@ class AnalyticWorld(nn.Module):
         """Samples the policy: ``clip(mean + std * noise, -1, 1)``, shape ``[..., A]``."""
         mean, log_std = self.policy(latent, log_std_bounds)
         return clipped_sample(mean, log_std.exp(), noise)
+
+
+if TYPE_CHECKING:  # what is written as these worlds are is a PredictionModel to a type checker as well
+    _TYPED: type[PredictionModel] = AnalyticWorld
 
 
 class LineWorld(AnalyticWorld):
