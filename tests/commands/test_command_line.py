@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
@@ -246,3 +247,33 @@ def test_an_error_without_words_is_named_by_its_kind(monkeypatch):
     monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
     with pytest.raises(SystemExit, match="^error: NotImplementedError$"):
         fail()
+
+
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_an_exit_code_stays_where_nobody_reads_what_is_written(monkeypatch, name):
+    reader, writer = os.pipe()
+    os.close(reader)  # as Ctrl-C ends the tee of `train | tee log`, too
+    stream = open(writer, "w")
+    monkeypatch.setattr(sys, name, stream)
+
+    @one_line_errors
+    def stopped() -> None:
+        stream.write("stopped at 10 env steps")
+        sys.exit(75)
+
+    with pytest.raises(SystemExit, match="^75$"):
+        stopped()
+    stream.close()  # Python does so at its end; an error would become its exit code
+
+
+@pytest.mark.parametrize(("where", "code"), [("pipe", 141), ("/dev/full", "error: [Errno 28] No space left on device")])
+def test_output_that_is_lost_is_no_success(monkeypatch, where, code):
+    reader, writer = os.pipe() if where == "pipe" else (os.open(os.devnull, os.O_RDONLY), os.open(where, os.O_WRONLY))
+    os.close(reader)
+    monkeypatch.setattr(sys, "stdout", open(writer, "w"))
+    monkeypatch.delenv("TORCHRL_ETDMPC_TRACEBACK", raising=False)
+
+    with pytest.raises(SystemExit) as stop:
+        one_line_errors(lambda: print("the answer"))()
+    assert stop.value.code == code
+    sys.stdout.close()

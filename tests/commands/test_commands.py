@@ -173,3 +173,15 @@ def test_ctrl_c_while_python_starts_prints_nothing_of_ours():
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=300)
     assert out == ""
+
+
+def test_ctrl_c_while_libraries_are_imported_ends_a_command_whose_messages_nobody_reads(in_copy):
+    def interrupted() -> None:
+        reader, writer = os.pipe()
+        os.close(reader)  # as Ctrl-C ends the tee of `train 2>&1 | tee log`, too
+        os.dup2(writer, 2)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        commands.importlib = SimpleNamespace(import_module=lambda name: signal.raise_signal(signal.SIGINT))
+        commands.main("train")
+
+    assert os.waitstatus_to_exitcode(in_copy(interrupted)) == 128 + signal.SIGINT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import os
@@ -120,5 +121,6 @@ def _choose_renderer(command: str, arguments: list[str]) -> None:
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
-    os.write(2, b"\nstopped before anything was begun\n")
+    with contextlib.suppress(OSError):  # Ctrl-C has ended a `tee` that read it
+        os.write(2, b"\nstopped before anything was begun\n")
     os._exit(128 + number)

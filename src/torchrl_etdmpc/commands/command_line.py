@@ -35,16 +35,22 @@ def one_line_errors(main: Callable[..., None]) -> Callable[..., None]:
     def wrapped(*args: Any) -> None:
         try:
             main(*args)
+            sys.stdout.flush()
         except KeyboardInterrupt:
             sys.exit(130)
         except BrokenPipeError:  # whoever read the output has gone, e.g. head
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(141)
         except Exception as error:
             if os.environ.get("TORCHRL_ETDMPC_TRACEBACK") == "1":
                 raise
             text = as_typed(" ".join(str(error).split()))
             sys.exit(f"error: {text or type(error).__name__}")
+        finally:
+            for stream in (sys.stdout, sys.stderr):
+                try:
+                    stream.flush()
+                except OSError:  # Python would try it again at its end, and exit with 120
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
     return wrapped
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
@@ -68,7 +69,8 @@ class StopSignals:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
         if self.requested:
-            os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
+            with contextlib.suppress(OSError):  # Ctrl-C has ended a `tee` that read it
+                os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
             os._exit(128 + number)
         self.requested = True
         if self.nothing_to_save:
