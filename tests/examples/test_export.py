@@ -86,6 +86,13 @@ def test_an_agent_of_a_gymnasium_task_is_exported(tmp_path, monkeypatch, capsys)
         )
 
 
+def test_a_full_disk_is_one_line(checkpoint, small_disk, leave_free, tmp_path, run_script):
+    leave_free(small_disk, 0)
+    process = run_script("export.py", f"checkpoint={checkpoint}", "out=disk/exported", cwd=tmp_path)
+    assert process.returncode == 1
+    assert process.stderr == "error: [Errno 28] No space left on device: 'disk/exported/policy.pt2'\n"
+
+
 def test_a_missing_checkpoint_is_one_line(tmp_path, run_script):
     process = run_script("export.py", "checkpoint=none.pt", cwd=tmp_path)
     assert process.returncode == 1

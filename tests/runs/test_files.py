@@ -372,6 +372,16 @@ def test_a_full_disk_leaves_the_old_file_whole_whatever_space_is_left(small_disk
     assert taken == list(range(taken[0], 200 * 1024, 4096))
 
 
+def test_a_file_that_cannot_be_written_is_named(small_disk, leave_free):
+    leave_free(small_disk, 0)
+    for path, reason in (
+        (small_disk / "notes.txt", "No space left on device"),
+        (small_disk / "missing" / "notes.txt", "No such file or directory"),
+    ):
+        with pytest.raises(OSError, match=rf"{reason}: '{path}'$"):
+            write_whole(path, "notes")
+
+
 def test_a_file_system_without_room_for_a_copy_of_a_link_says_so(small_disk, leave_free, monkeypatch):
     def no_links(*_):
         raise OSError(errno.EPERM, "Operation not permitted")

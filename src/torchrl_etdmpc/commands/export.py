@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,7 @@ import torch
 from torchrl_etdmpc.commands.agent_command import AgentCommandConfig
 from torchrl_etdmpc.commands.command_line import hydra_main
 from torchrl_etdmpc.planners import export_planner, export_policy
-from torchrl_etdmpc.runs import replacing
-from torchrl_etdmpc.runs.files import make_folder
+from torchrl_etdmpc.runs.files import make_folder, write_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +53,9 @@ def main(config: ExportConfig) -> None:
             actions.append(plan(observation, plan_mean)[0])
         torch.testing.assert_close(*actions)
     for name, program in (("policy", policy), ("planner", planner)):
-        with replacing(out / f"{name}.pt2") as partial:
-            torch.export.save(program, partial)
+        memory = io.BytesIO()  # where a disk is full, PyTorch would end the process without a word of it
+        torch.export.save(program, memory)
+        write_whole(out / f"{name}.pt2", memory.getvalue())
     print(
         f"{run.task}: {out}/policy.pt2 and {out}/planner.pt2, observations {list(observation.shape)}, actions "
         f"{list(actions[0].shape)}, plan_mean {list(plan_mean.shape)}"

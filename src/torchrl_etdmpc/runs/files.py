@@ -32,6 +32,9 @@ def replacing(path: Path) -> Iterator[Path]:
     The temporary name is nobody else's, also of those that share the folder from other threads or machines. It keeps
     the suffix (programs that write films choose their format by it).
 
+    Raises:
+        OSError: if it cannot be written; it names ``path``.
+
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "notes.txt"
     >>> with replacing(path) as partial:
@@ -45,6 +48,10 @@ def replacing(path: Path) -> Iterator[Path]:
         sync(partial)
         os.replace(partial, path)
         sync(path.parent)
+    except OSError as error:
+        if error.errno is not None and str(error.filename) in ("None", str(partial)):  # a write's error names no file
+            error.filename = str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 
