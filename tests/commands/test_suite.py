@@ -131,7 +131,7 @@ def test_a_dry_run_says_what_would_be_run_and_changes_nothing(call, mine, tmp_pa
     assert message is None
     lines = out.splitlines()
     assert len(lines) == 6
-    assert lines[0].startswith("python -m torchrl_etdmpc.commands train task=")
+    assert lines[0].startswith("python -P -m torchrl_etdmpc.commands train task=")
     assert f"run_dir={tmp_path}/here/b/cup-catch/seed2" in lines[3]
     assert "loss.rho=0.4" in lines[3]
     assert lines[-1] == "4 runs, 1,600 env steps"

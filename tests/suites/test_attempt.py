@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -24,10 +25,10 @@ def parsed(monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
 
     def parse(words: list[str]) -> TrainConfig:
-        assert words[:4] == [sys.executable, "-m", "torchrl_etdmpc.commands", "train"]
+        assert words[:5] == [sys.executable, "-P", "-m", "torchrl_etdmpc.commands", "train"]
         got: list[TrainConfig] = []
         monkeypatch.setattr(train, "train", got.append)
-        monkeypatch.setattr(sys, "argv", ["torchrl-etdmpc train", *words[4:]])
+        monkeypatch.setattr(sys, "argv", ["torchrl-etdmpc train", *words[5:]])
         train.main()
         return got[0]
 
@@ -71,6 +72,14 @@ def test_settings_of_every_kind_are_parsed_back(parsed, small, tmp_path):
     (run,) = small.experiment(variants=variants).runs(tmp_path)
     assert parsed(command(run)) == as_asked(run)
     assert parsed(command(run, threads=3)).threads == 3
+
+
+def test_a_run_imports_nothing_of_the_folder_that_its_suite_was_begun_in(small, tmp_path):
+    (tmp_path / "random.py").write_text("raise SystemExit('another module')")
+    words = command(small.experiment().runs(tmp_path)[0])
+    line = [*words[: words.index("train")], "--help"]
+    asked = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (asked.returncode, asked.stderr) == (0, "")
 
 
 def test_a_run_begins_in_a_directory_of_its_own_with_its_own_threads_and_gpu(small, tmp_path, monkeypatch):

@@ -85,7 +85,7 @@ def test_bash_reads_it_and_the_options_are_there(small, tmp_path):
     ]
     lines = [shlex.split(line) for line in table_of(script).read_text().splitlines()]
     assert [line[0] for line in lines] == [str(log_file(run)) for run in runs]
-    assert all(line[1:5] == [sys.executable, "-m", "torchrl_etdmpc.commands", "train"] for line in lines)
+    assert all(line[1:6] == [sys.executable, "-P", "-m", "torchrl_etdmpc.commands", "train"] for line in lines)
     assert not any("SLURM_CPUS_PER_TASK" in word for line in lines for word in line)  # they say their own threads
 
 

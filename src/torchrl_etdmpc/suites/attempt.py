@@ -42,7 +42,8 @@ def command(run: Run, **more: Any) -> list[str]:
     values = first | differing | {"run_dir": str(run.path), "resume": "auto"} | more
     typed = {typed_name(name): value for name, value in values.items()}
     words = [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in typed.items()]
-    return [sys.executable, "-m", "torchrl_etdmpc.commands", "train", *words]
+    # -P: -m alone would import a random.py of the folder that the suite was begun in.
+    return [sys.executable, "-P", "-m", "torchrl_etdmpc.commands", "train", *words]
 
 
 def log_file(run: Run) -> Path:
