@@ -86,6 +86,14 @@ def test_without_a_command_the_commands_are_listed(run_main):
     assert run_main("tran")[0] == f"error: unknown command 'tran'; choose one of {known}."
 
 
+def test_a_current_directory_that_was_removed_is_one_line(run_main, tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert run_main("train", "--help")[0] == "error: the current directory was removed; change to another one."
+
+
 @pytest.mark.parametrize(
     ("command", "arguments", "before", "after"),
     [

@@ -51,6 +51,10 @@ def main(command: str | None = None) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # the last line of a run may name a folder in any alphabet
     if command is None:
         command = _first_argument()
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        sys.exit("error: the current directory was removed; change to another one.")
     _choose_renderer(command, sys.argv[1:])
     handler = signal.getsignal(signal.SIGINT)
     quiet = handler is signal.default_int_handler and threading.current_thread() is threading.main_thread()
