@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("hydra")
 
+from torchrl_etdmpc.commands import train  # noqa: E402
 from torchrl_etdmpc.commands.command_line import as_typed, hydra_main, one_line_errors  # noqa: E402
 from torchrl_etdmpc.commands.evaluate import EvaluateConfig  # noqa: E402
 from torchrl_etdmpc.commands.export import ExportConfig  # noqa: E402
@@ -264,6 +265,19 @@ def test_an_exit_code_stays_where_nobody_reads_what_is_written(monkeypatch, name
     with pytest.raises(SystemExit, match="^75$"):
         stopped()
     stream.close()  # Python does so at its end; an error would become its exit code
+
+
+def test_a_run_that_was_stopped_says_so_where_nobody_reads_what_it_prints(monkeypatch):
+    def stopped(*_: Any) -> None:
+        raise train.RunInterrupted("stopped at 10 env steps")
+
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr(train, "launch", stopped)
+    monkeypatch.setattr(sys, "stdout", open(writer, "w", buffering=1))
+    with pytest.raises(SystemExit, match="^75$"):
+        one_line_errors(train.train)(TrainConfig())
+    sys.stdout.close()
 
 
 @pytest.mark.parametrize(("where", "code"), [("pipe", 141), ("/dev/full", "error: [Errno 28] No space left on device")])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -285,6 +286,20 @@ def test_a_trial_that_ended_early_is_no_failure(call, mine, monkeypatch):
     message, out = call(f"experiment={mine()}", "runs_dir=here")
     assert message == 0
     assert out.splitlines()[-1] == "4 runs: 4 pruned"
+
+
+def test_a_suite_whose_output_nobody_reads_still_stops_its_runs(call, mine, monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)  # as Ctrl-C ends the tee of `suite | tee log`, too
+
+    def run_locally(queue, **places) -> bool:
+        monkeypatch.setattr(sys, "stdout", open(writer, "w"))
+        queue.say("stopping: 2 runs save themselves")  # before they are told
+        return False
+
+    monkeypatch.setattr(suite, "run_locally", run_locally)
+    assert call(f"experiment={mine()}")[0] == 75
+    sys.stdout.close()
 
 
 @pytest.mark.parametrize(

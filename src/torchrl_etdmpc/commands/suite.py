@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shlex
 import sys
@@ -252,11 +253,13 @@ def _carry_out(config: SuiteConfig, asked: Experiment, runs: list[Run], folder: 
         else:
             ended = run_locally(queue, workers=config.workers, per_gpu=config.per_gpu)
     progress = RunIndex(folder / "index.sqlite").read(queue.runs)
-    print(status_text(queue.runs, progress, config.workers or 1))
-    for sweep in sweeps:
-        print(sweep.best())
+    with contextlib.suppress(BrokenPipeError):  # the exit code is still read
+        print(status_text(queue.runs, progress, config.workers or 1))
+        for sweep in sweeps:
+            print(sweep.best())
+        if not ended:
+            print("stopped; the same command goes on.")
     if not ended:
-        print("stopped; the same command goes on.")
         return EXIT_CODE
     return int(any(entry.state not in ("finished", "pruned") for entry in progress))
 
@@ -408,4 +411,5 @@ def _plan(experiment: Experiment, runs: list[Run]) -> str:
 
 
 def _say(line: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)
+    with contextlib.suppress(OSError):  # whoever read it has gone: the runs are still to be stopped
+        print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 
 from torchrl_etdmpc.commands.command_line import as_typed, explicit_settings, hydra_main
@@ -25,5 +26,6 @@ def train(config: TrainConfig) -> None:
     try:
         print(launch(config, explicit_settings()))
     except RunInterrupted as stop:
-        print(as_typed(str(stop)))
+        with contextlib.suppress(OSError):  # the exit code is still read, e.g. after Ctrl-C in `train | tee log`
+            print(as_typed(str(stop)))
         sys.exit(EXIT_CODE)
