@@ -118,7 +118,7 @@ def test_an_empty_list_is_not_the_whole_experiment(call, mine, empty):
 
 
 @pytest.mark.parametrize("tasks", ["reacher-easy,cup-catch", "[reacher-easy,cup-catch]", "[reacher-easy, cup-catch]"])
-@pytest.mark.parametrize("variants", ["b,a", "[b, a]"])
+@pytest.mark.parametrize("variants", ["b,a", "[b, a]", "['b', \"a\"]"])
 def test_tasks_and_variants_are_lists_with_or_without_brackets(call, mine, tasks, variants):
     message, out = call(f"experiment={mine()}", "dry_run=true", f"tasks={tasks}", f"variants={variants}", "seeds=1")
     assert message is None

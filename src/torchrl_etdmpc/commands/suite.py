@@ -355,16 +355,17 @@ def _value(text: str) -> Any:
 
 
 def _listed(text: str | None) -> list[str]:
-    """The entries of a list, in brackets or not.
+    """The entries of a list, in brackets or not, in quotes or not.
 
-    >>> _listed("walker-walk,cup-catch"), _listed("[walker-walk, cup-catch]"), _listed(None)
+    >>> _listed("walker-walk,cup-catch"), _listed("[walker-walk, 'cup-catch']"), _listed(None)
     (['walker-walk', 'cup-catch'], ['walker-walk', 'cup-catch'], [])
     """
     if not text:
         return []
     text = text.strip()
     text = text[1:-1] if text.startswith("[") and text.endswith("]") else text
-    return [entry.strip() for entry in text.split(",")]
+    entries = [entry.strip() for entry in text.split(",")]
+    return [entry[1:-1] if entry[:1] == entry[-1:] and entry[:1] in ("'", '"') else entry for entry in entries]
 
 
 def _experiment(config: SuiteConfig, settings: dict[str, Any]) -> Experiment:
