@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import fcntl
 import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -147,7 +149,10 @@ def test_a_run_that_is_killed_twenty_times_ends_as_if_it_had_not_been(tmp_path, 
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGUSR1))],
+    [
+        signal.SIGTERM,
+        *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)),
+    ],
     ids=lambda number: number.name,
 )
 def test_a_run_that_is_asked_to_stop_saves_and_goes_on_later(tmp_path, train, straight, number):
@@ -172,6 +177,35 @@ def test_a_signal_that_reaches_the_environments_too_is_left_to_the_run(tmp_path,
     os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C does, and job schedulers
     assert "env steps and saved in run; go on with resume=true." in finish(process, EXIT_CODE)
     finish(train(tmp_path, "run_dir=run", "resume=true"))
+    assert results(tmp_path / "run") == results(tmp_path / "straight" / "run")
+
+
+@pytest.mark.slow  # five worker processes, and imports from the beginning
+def test_a_run_whose_terminal_is_closed_is_saved_and_goes_on_later(tmp_path, train):
+    (tmp_path / "straight").mkdir()
+    finish(train(tmp_path / "straight", "run_dir=run", "num_envs=2"))
+    screen, terminal = os.openpty()
+    script = Path(__file__).parents[2] / "examples" / "train_dmc.py"
+    process = subprocess.Popen(
+        [sys.executable, str(script), "task=cartpole-balance", *COMMAND, "run_dir=run", "num_envs=2"],
+        cwd=tmp_path,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(terminal)
+    wait_for(lambda: len(checkpoints(tmp_path / "run")) > 0, process)
+    os.close(screen)  # the system signals all processes of the session
+    assert process.wait(60) == EXIT_CODE
+    for _ in range(100):
+        left = subprocess.run(["pgrep", "-l", "-g", str(process.pid)], capture_output=True, text=True, check=False)
+        if not left.stdout:
+            break
+        time.sleep(0.1)
+    assert left.stdout == ""
+    finish(train(tmp_path, "run_dir=run", "resume=true", "num_envs=2"))
     assert results(tmp_path / "run") == results(tmp_path / "straight" / "run")
 
 

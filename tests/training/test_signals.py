@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import signal
 
-from torchrl_etdmpc.training.signals import StopSignals
+import pytest
+
+from torchrl_etdmpc.training.signals import EXIT_CODE, StopSignals
 
 
 def test_a_second_signal_ends_a_process_whose_messages_nobody_reads(in_copy):
@@ -19,3 +21,29 @@ def test_a_second_signal_ends_a_process_whose_messages_nobody_reads(in_copy):
             signal.raise_signal(signal.SIGINT)
 
     assert os.waitstatus_to_exitcode(in_copy(stopped_twice)) == 128 + signal.SIGINT
+
+
+@pytest.mark.parametrize("others", [("SIGHUP",), ("SIGHUP", "SIGHUP", "SIGTERM"), ("SIGTERM", "SIGHUP")])
+def test_a_terminal_that_is_closed_stops_a_run_and_never_ends_it_at_once(others):
+    before = signal.getsignal(signal.SIGHUP)
+    with StopSignals() as stop:
+        stop.nothing_to_save = False
+        for name in others:
+            signal.raise_signal(getattr(signal, name))
+        assert stop.requested
+    assert signal.getsignal(signal.SIGHUP) == before
+
+
+def test_a_terminal_that_is_closed_leaves_a_run_with_nothing_to_save():
+    with pytest.raises(SystemExit, match=f"^{EXIT_CODE}$"), StopSignals():
+        signal.raise_signal(signal.SIGHUP)
+
+
+def test_nohup_outlives_its_terminal():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignals() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.requested
+    finally:
+        signal.signal(signal.SIGHUP, before)

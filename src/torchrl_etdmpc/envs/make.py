@@ -50,8 +50,8 @@ def make_env(
             system. With several environments each gets its own seed, derived from this one.
         num_envs (int): how many copies, at least 1. One is the environment itself, with batch size []. More are
             processes of a :class:`~torchrl.envs.ParallelEnv` with batch size [num_envs]; a script that makes them needs
-            the usual ``if __name__ == "__main__":`` guard, and should close them. SIGINT, SIGTERM and SIGUSR1
-            do not end them: their owner saves first and ends them. If it dies, they end within ten seconds.
+            the usual ``if __name__ == "__main__":`` guard, and should close them. SIGINT, SIGTERM, SIGUSR1 and
+            SIGHUP do not end them: their owner saves first and ends them. If it dies, they end within ten seconds.
         parallel (bool): ``False`` steps several environments one after the other in this process instead
             (:class:`~torchrl.envs.SerialEnv`); on few cores that is faster.
         device (torch.device or str): where the tensors go; the physics runs on the CPU.

@@ -23,8 +23,10 @@ from torchrl_etdmpc.envs.seeding import seed_everything
 _PATIENCE_S = 300
 # How often a worker process looks for its owner after a signal to stop, in seconds.
 _GRACE_S = 10
-# Signals to stop: of the keyboard, of SLURM and of Kubernetes.
-STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGUSR1") if hasattr(signal, name))
+# Signals to stop: of the keyboard, of SLURM and of Kubernetes, and of a terminal that is closed.
+STOP_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP") if hasattr(signal, name)
+)
 
 
 @contextlib.contextmanager

@@ -40,7 +40,7 @@ def run_locally(queue: RunQueue, *, workers: int | None = None, per_gpu: int = 1
     """Trains what is not finished, several runs at a time, until all are or have failed.
 
     A run that is stopped is gone on with, a run that fails is tried again; one that another process is training is
-    waited for. SIGTERM, SIGINT or SIGUSR1 stops all of them: each saves itself.
+    waited for. SIGTERM, SIGINT, SIGUSR1 or SIGHUP stops all of them: each saves itself.
 
     Args:
         queue (RunQueue): the runs.

@@ -31,6 +31,9 @@ class StopSignals:
     While there is nothing to save, the first one raises SystemExit, wherever the program is. Only the main thread can
     handle signals; in another one this does nothing.
 
+    SIGHUP, of a terminal that is closed, may come twice and beside SIGTERM, so it counts as neither the first nor the
+    second. Where it is ignored, by ``nohup``, it stays so.
+
     Attributes:
         requested (bool): whether a signal has come.
         nothing_to_save (bool): Default: ``True``.
@@ -43,11 +46,13 @@ class StopSignals:
     def __init__(self) -> None:
         self.requested = False
         self.nothing_to_save = True
+        self._asked = False
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._handle) for number in STOP_SIGNALS}
+            taken = [number for number in STOP_SIGNALS if not (_is_hangup(number) and _is_ignored(number))]
+            self._before = {number: signal.signal(number, self._handle) for number in taken}
         return self
 
     def __exit__(
@@ -67,12 +72,24 @@ class StopSignals:
             raise WorkLeftError
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        name = signal.Signals(number).name
-        if self.requested:
+        name, hangup = signal.Signals(number).name, _is_hangup(number)
+        if self._asked and not hangup:
             with contextlib.suppress(OSError):  # Ctrl-C has ended a `tee` that read it
                 os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
             os._exit(128 + number)
+        self._asked |= not hangup
+        if self.requested:
+            return
         self.requested = True
         if self.nothing_to_save:
             raise SystemExit(EXIT_CODE)
-        torchrl_logger.info(f"{name}: finishing this step, saving and stopping; send it again to stop at once")
+        again = "" if hangup else "; send it again to stop at once"
+        torchrl_logger.info(f"{name}: finishing this step, saving and stopping{again}")
+
+
+def _is_hangup(number: int) -> bool:
+    return number == getattr(signal, "SIGHUP", None)
+
+
+def _is_ignored(number: int) -> bool:
+    return signal.getsignal(number) == signal.SIG_IGN
