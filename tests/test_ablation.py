@@ -233,4 +233,4 @@ def test_the_study_of_the_ablation_has_the_areas_of_the_committed_files(committe
             cells += [script.written(*script.interval(each))]
             assert f"| {' | '.join(cells)} |" in page
             found += 1
-    assert found == 5
+    assert found == 7
