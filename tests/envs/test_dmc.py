@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import logging
+import sys
 import warnings
 
 import numpy as np
@@ -242,18 +243,25 @@ def test_notices_are_hidden_while_a_task_is_made_and_shown_before_and_after(monk
     assert caplog.messages == ["before", "after"]
 
 
-def test_a_missing_dm_control_is_one_line_that_says_what_to_install(monkeypatch):
+NEEDED = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
+WITHOUT_LABMAZE = (
+    "pip install 'mujoco>=3.17,<4' absl-py dm-env dm-tree glfw lxml protobuf pyopengl pyparsing requests scipy tqdm && "
+    "pip install --no-deps 'dm-control==1.0.50'"
+)
+
+
+@pytest.mark.parametrize(("python", "needed"), [((3, 12, 9), NEEDED), ((3, 13, 0), WITHOUT_LABMAZE)])
+def test_a_missing_dm_control_is_one_line_that_says_what_to_install(monkeypatch, python, needed):
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
         lambda name, package=None: None if name == "dm_control" else find_spec(name, package),
     )
+    monkeypatch.setattr(sys, "version_info", python)
     with pytest.raises(ImportError) as error:
         make_env("walker-walk")
-    assert str(error.value) == (
-        "dm_control tasks need dm-control, which is missing; run: pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
-    )
+    assert str(error.value) == f"dm_control tasks need dm-control, which is missing; run: {needed}"
 
 
 @pytest.mark.parametrize(
@@ -268,9 +276,9 @@ def test_a_mujoco_that_breaks_this_dm_control_is_refused_in_one_line(mujoco, dm_
         return
     with pytest.raises(ImportError) as error:
         make_env("pendulum-swingup")
+    needed = NEEDED if sys.version_info < (3, 13) else WITHOUT_LABMAZE
     assert str(error.value) == (
-        f"dm-control {dm_control} does not work with mujoco {mujoco}; "
-        "run in a fresh virtual environment: pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
+        f"dm-control {dm_control} does not work with mujoco {mujoco}; run in a fresh virtual environment: {needed}"
     )
 
 

@@ -144,9 +144,9 @@ def test_a_missing_simulator_is_named_in_one_line(tmp_path, monkeypatch, run_her
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "dm_control" else find_spec(name, *rest)
     )
-    needed = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
-    told = f"error: dm_control tasks need dm-control, which is missing; run: {needed}"
-    assert run_here("train_dmc.py", *SMALL_RUN) == (told, "", "")
+    error, *printed = run_here("train_dmc.py", *SMALL_RUN)
+    assert error.startswith("error: dm_control tasks need dm-control, which is missing; run: pip install ")
+    assert printed == ["", ""]
     assert list(tmp_path.iterdir()) == []
 
 

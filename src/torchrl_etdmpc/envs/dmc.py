@@ -7,6 +7,7 @@ import copy
 import importlib.metadata
 import importlib.util
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,6 +22,11 @@ from torchrl_etdmpc.envs.random_states import pack_mt19937, unpack_mt19937
 from torchrl_etdmpc.envs.tasks import Maker, Task
 
 _INSTALL = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
+# dm-control asks for labmaze, of which the suite has no need and Python 3.13 no wheel: the others, and then itself alone.
+_INSTALL_WITHOUT_LABMAZE = (
+    "pip install 'mujoco>=3.17,<4' absl-py dm-env dm-tree glfw lxml protobuf pyopengl pyparsing requests scipy tqdm && "
+    "pip install --no-deps 'dm-control==1.0.50'"
+)
 # The last dm_control release known to need MuJoCo 3.
 _LAST_FOR_MUJOCO_3 = (1, 0, 50)
 # The benchmark tables shorten one domain name.
@@ -88,16 +94,20 @@ def dmc_maker(task: Task) -> Maker:
         ImportError: if dm-control is missing, or if it cannot work with the installed MuJoCo.
     """
     if importlib.util.find_spec("dm_control") is None:
-        raise ImportError(f"dm_control tasks need dm-control, which is missing; run: {_INSTALL}")
+        raise ImportError(f"dm_control tasks need dm-control, which is missing; run: {_install()}")
     mujoco = importlib.metadata.version("mujoco")
     dm_control = importlib.metadata.version("dm-control")
     if _release(mujoco) >= (4,) and _release(dm_control) <= _LAST_FOR_MUJOCO_3:
         # MuJoCo 4 shares files with packages that a downgrade leaves behind, hence the fresh environment.
         raise ImportError(
             f"dm-control {dm_control} does not work with mujoco {mujoco}; "
-            f"run in a fresh virtual environment: {_INSTALL}"
+            f"run in a fresh virtual environment: {_install()}"
         )
     return _make
+
+
+def _install() -> str:
+    return _INSTALL if sys.version_info < (3, 13) else _INSTALL_WITHOUT_LABMAZE
 
 
 def domain_and_task(name: str) -> tuple[str, str]:
