@@ -22,7 +22,7 @@ from torchrl_etdmpc.envs.random_states import pack_mt19937, unpack_mt19937
 from torchrl_etdmpc.envs.tasks import Maker, Task
 
 _INSTALL = "pip install 'dm-control==1.0.50' 'mujoco>=3.17,<4'"
-# dm-control asks for labmaze, of which the suite has no need and Python 3.13 no wheel: the others, and then itself alone.
+# dm-control asks for labmaze, of which the suite has no need and Python 3.13 no wheel: the others, then itself alone.
 _INSTALL_WITHOUT_LABMAZE = (
     "pip install 'mujoco>=3.17,<4' absl-py dm-env dm-tree glfw lxml protobuf pyopengl pyparsing requests scipy tqdm && "
     "pip install --no-deps 'dm-control==1.0.50'"
