@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 
 import pytest
 
@@ -23,27 +24,31 @@ def test_a_second_signal_ends_a_process_whose_messages_nobody_reads(in_copy):
     assert os.waitstatus_to_exitcode(in_copy(stopped_twice)) == 128 + signal.SIGINT
 
 
+@pytest.fixture
+def in_a_terminal() -> Iterator[None]:
+    """Also where the tests themselves were started by ``nohup``."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("others", [("SIGHUP",), ("SIGHUP", "SIGHUP", "SIGTERM"), ("SIGTERM", "SIGHUP")])
-def test_a_terminal_that_is_closed_stops_a_run_and_never_ends_it_at_once(others):
-    before = signal.getsignal(signal.SIGHUP)
+def test_a_terminal_that_is_closed_stops_a_run_and_never_ends_it_at_once(in_a_terminal, others):
     with StopSignals() as stop:
         stop.nothing_to_save = False
         for name in others:
             signal.raise_signal(getattr(signal, name))
         assert stop.requested
-    assert signal.getsignal(signal.SIGHUP) == before
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
 
 
-def test_a_terminal_that_is_closed_leaves_a_run_with_nothing_to_save():
+def test_a_terminal_that_is_closed_leaves_a_run_with_nothing_to_save(in_a_terminal):
     with pytest.raises(SystemExit, match=f"^{EXIT_CODE}$"), StopSignals():
         signal.raise_signal(signal.SIGHUP)
 
 
-def test_nohup_outlives_its_terminal():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with StopSignals() as stop:
-            signal.raise_signal(signal.SIGHUP)
-            assert not stop.requested
-    finally:
-        signal.signal(signal.SIGHUP, before)
+def test_nohup_outlives_its_terminal(in_a_terminal):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with StopSignals() as stop:
+        signal.raise_signal(signal.SIGHUP)
+        assert not stop.requested
