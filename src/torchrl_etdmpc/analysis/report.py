@@ -87,6 +87,9 @@ def write_report(
     Returns:
         Path: of ``index.md``.
 
+    Raises:
+        ValueError: as :func:`require_report_folder`.
+
     >>> import tempfile
     >>> from torchrl_etdmpc.analysis import compare, get_benchmark, seed_estimates
     >>> curve = {"task": "walker-walk", "seed": 1, "env_steps": [0, 100_000, 200_000], "return_mean": [0, 450, 900]}

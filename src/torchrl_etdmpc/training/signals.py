@@ -31,8 +31,8 @@ class StopSignals:
     While there is nothing to save, the first one raises SystemExit, wherever the program is. Only the main thread can
     handle signals; in another one this does nothing.
 
-    SIGHUP, of a terminal that is closed, may come twice and beside SIGTERM, so it counts as neither the first nor the
-    second. Where it is ignored, by ``nohup``, it stays so.
+    SIGHUP, of a terminal that is closed, may come twice and beside SIGTERM: it is noted, but never one of the two that
+    end the process at once. Where it is ignored, by ``nohup``, it stays so.
 
     Attributes:
         requested (bool): whether a signal has come.
