@@ -1,6 +1,6 @@
 """Variants of the cpu preset beside it: the runs of an experiment, what is kept of them, tables and a figure.
 
-    python benchmarks/ablation.py                          # 10 variants, 5 tasks, 5 seeds, 50,000 env steps: days
+    python benchmarks/ablation.py                          # 12 variants, 5 tasks, 5 seeds, 50,000 env steps: days
     python benchmarks/ablation.py --variants "all four off (BMPC)" --tasks walker-run hopper-stand --seeds 1
     python benchmarks/ablation.py --experiment adaptive    # 5 variants, 4 tasks, 5 seeds: a day
     python benchmarks/ablation.py --report-only            # from the committed files
