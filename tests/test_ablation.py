@@ -234,3 +234,28 @@ def test_the_study_of_the_ablation_has_the_areas_of_the_committed_files(committe
             assert f"| {' | '.join(cells)} |" in page
             found += 1
     assert found == 7
+
+
+def test_the_study_of_the_ablation_has_what_all_four_parts_do(committed):
+    script, read = committed
+    _, experiment, pairs, _ = read("cpu-ablation")
+    page = " ".join((BENCHMARKS.parent / "docs" / "studies" / "ablation.md").read_text().split())
+    rows = pairs.xs("all four off (BMPC)", level="variant")
+    complete = [row for row in script.tasks_table(rows, experiment) if "| 1, 2, 3, 4, 5 |" in row]
+    assert len(complete) == 6
+    assert [row for row in complete if row not in page] == []
+
+    columns = (str(script.ENV_STEPS), "area")
+    by_task = rows.groupby("task").mean()
+    named = {
+        "the five of the experiment": list(experiment.tasks),
+        "all 15 that the preset was not tuned on": list(by_task.index),
+    }
+    for name, tasks in named.items():
+        cells = [script.written(*script.interval(script.differences(by_task.loc[tasks], column))) for column in columns]
+        assert f"| {name} | {' | '.join(cells)} |" in page
+    ends = []
+    for column in columns:
+        mean, half = script.interval_over_seeds(script.differences(rows, column).loc[list(experiment.tasks)])
+        ends.append(f"between {mean - half:+.0f} and {mean + half:+.0f}")
+    assert f"{ends[0]} at 50,000, and {ends[1]} in area" in page
