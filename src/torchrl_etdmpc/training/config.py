@@ -237,7 +237,7 @@ class TrainConfig:
     logger: LoggerName = "none"
     """Where the numbers go besides the run's own files."""
     eval_every: int = 50_000
-    """Environment steps between two evaluations."""
+    """Environment steps between two evaluations of learning; the one before it is of the untrained agent."""
     eval_episodes: int = 10
     """Episodes of an evaluation."""
     eval_policy: bool = False
