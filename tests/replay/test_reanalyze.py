@@ -541,6 +541,27 @@ def test_a_sample_that_comes_as_slices_is_refreshed_like_a_flat_one():
     assert (flat == shaped).all() and (stored == stored_too).all() and count == count_too == 6
 
 
+def test_rows_that_hold_numbers_without_a_dimension_of_their_own_are_renewed_too():
+    shorter = rows(40)
+    for name in ("value", "version"):
+        shorter["plan", name] = shorter["plan", name].squeeze(-1)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(40),
+        sampler=StepSliceSampler(SLICE_LEN),
+        writer=TensorDictRoundRobinWriter(track_generations=True),
+        batch_size=4 * SLICE_LEN,
+    )
+    buffer.extend(shorter)
+    reanalyze = make_reanalyze(buffer)
+    batch = buffer.sample()
+    assert batch["plan", "value"].shape == batch["plan", "version"].shape == batch.batch_size
+    renewed = slice(0, 2 * SLICE_LEN)
+    assert torch.equal(batch["plan", "value"][renewed], -batch["plan", "loc"][renewed, 0])
+    assert (batch["plan", "version"][renewed] == 50).all()
+    assert torch.equal(batch["plan", "value"][renewed], content(buffer)[batch["index"]]["plan", "value"][renewed])
+    assert reanalyze.target_age == (50 - batch["index"][renewed] % 7).float().mean()
+
+
 def test_a_transform_serves_one_buffer():
     first, second = make_buffer(40), make_buffer(40)
     reanalyze = make_reanalyze(first)

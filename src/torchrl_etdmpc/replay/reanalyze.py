@@ -241,7 +241,8 @@ class ReanalyzeTransform(Transform):
         with set_exploration_type(ExplorationType.RANDOM):
             planned = self.planner(states)
         planned = planned.select(*self.plan_keys.values()).to(observation.device)
-        age = planned.get(self.plan_keys[VERSION]) - tensordict.get(self.plan_keys[VERSION])[:rows]
+        versions = tensordict.get(self.plan_keys[VERSION])[:rows]
+        age = planned.get(self.plan_keys[VERSION]).reshape(versions.shape) - versions
         self.target_age = age.float().mean()
         patch = {key: planned.get(key)[original] for key in self.plan_keys.values()}
         result = buffer.update_if_present(index=index, generation=generation, patch=patch)
@@ -249,7 +250,7 @@ class ReanalyzeTransform(Transform):
         self.stale += result.stale_count
         for key, value in patch.items():
             stored = tensordict.get(key).clone()
-            stored[:rows] = value
+            stored[:rows] = value.reshape(stored[:rows].shape)  # rows may hold numbers [B] for the planner's [B, 1]
             tensordict.set(key, stored)
         # Rows beyond the first slices may be copies of re-planned ones; they keep their old target in this batch.
         return tensordict
