@@ -12,7 +12,7 @@ import torch
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
-from tensordict import TensorDict
+from tensordict import NonTensorStack, TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import (
     ImmutableDatasetWriter,
@@ -574,6 +574,15 @@ def test_rows_without_a_trajectory_id_are_refused():
         buffer.sample()
 
 
+@pytest.mark.parametrize("key", ["episode", "collector"], ids=["texts", "a dictionary"])
+def test_trajectory_ids_that_are_no_numbers_are_refused(key):
+    sampler = StepSliceSampler(3, traj_key=key)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=sampler, batch_size=6)
+    buffer.extend(_rows([0] * 9).set("episode", NonTensorStack(*["a"] * 9)))
+    with pytest.raises(TypeError, match=f"tells episodes apart by whole numbers, .* at '{key}'; number the episodes"):
+        buffer.sample()
+
+
 @pytest.mark.parametrize("before", [7, 10, 13], ids=["part", "just full", "around"])
 @pytest.mark.parametrize("after", [(), (1,), (4, 6), (3, 9)])
 def test_a_buffer_that_was_filled_before_it_got_the_sampler_is_sampled_whole(before, after):
@@ -672,6 +681,12 @@ def test_a_data_set_that_fills_its_storage_is_sampled_from_its_first_row_on():
     )
     starts = set(buffer.sample()["t"][:, 0].tolist())
     assert starts == {0, 1, 2, 3, *range(6, 11), *range(13, 18)}
+
+
+def test_a_data_set_in_a_buffer_that_could_be_written_to_is_told_the_writer():
+    buffer = TensorDictReplayBuffer(storage=TensorStorage(_rows([0] * 6)), sampler=StepSliceSampler(3), batch_size=6)
+    with pytest.raises(RuntimeError, match=r"build the buffer with writer=ImmutableDatasetWriter\(\)"):
+        buffer.sample()
 
 
 def test_a_buffer_that_another_sampler_dumped_is_read_anew(tmp_path):

@@ -68,8 +68,8 @@ class StepSliceSampler(Sampler):
     Raises:
         ValueError: if an argument is out of range, a batch size is not a multiple of ``slice_len``, or the rows of the
             buffer are batches.
-        TypeError: if the storage is not a flat tensor storage, the buffer's writer does not write round the ring, or,
-            with ``partial``, the buffer does not add the mask to its samples.
+        TypeError: if the storage is not a flat tensor storage, the buffer's writer does not write round the ring, an id
+            is no number, or, with ``partial``, the buffer does not add the mask to its samples.
         KeyError: if the rows lack ``traj_key``, or ``done_key`` where it is needed: with ``partial``, and where only
             ``env_index`` tells rows apart.
         RuntimeError: if there is no complete slice yet, the sampler missed writes, or it is that of another buffer.
@@ -286,7 +286,8 @@ class StepSliceSampler(Sampler):
             if newest is None:
                 raise RuntimeError(
                     f"the buffer was full ({capacity} rows) before the sampler saw it, and which row is the oldest is "
-                    "not known; write one row, or save and load the sampler together with the storage."
+                    "not known; write one row, or save and load the sampler together with the storage; of a data set "
+                    "that begins with its first row, build the buffer with writer=ImmutableDatasetWriter()."
                 )
         self._newest = int(newest)
         self._written = self._newest + 1 + (capacity if stored == capacity else 0)
@@ -301,6 +302,12 @@ class StepSliceSampler(Sampler):
                 "environments writes by itself, Collector(..., postproc=lambda batch: batch.reshape(-1))."
             )
         keys = self._id_keys(stored)
+        others = [key for key in keys if not isinstance(stored.get(key), Tensor)]
+        if others:
+            raise TypeError(
+                f"StepSliceSampler tells episodes apart by whole numbers, got texts or a dictionary at "
+                f"{', '.join(map(repr, others))}; number the episodes in every row and pass that key as traj_key=..."
+            )
         if self.partial and stored.get(self.done_key, None) is None:
             raise KeyError(
                 f"partial=True needs {self.done_key!r} in every row, to know which episodes have ended; store it, or "
