@@ -224,11 +224,14 @@ def in_order(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
 
 
 def draw(pairs: pd.DataFrame, experiment: Experiment) -> Figure:
-    """A column for each variant: the difference on every task and with every seed, and for several tasks their mean.
+    """A column for each variant: the difference on every task and with every seed, and the mean over tasks.
 
-    Above of the returns at ``ENV_STEPS``, below of the areas.
+    Above of the returns at ``ENV_STEPS``, below of the areas. Where some variants were run on ``LEAST`` tasks or more,
+    the others stand in the tables alone.
     """
-    variants, tasks = in_order(pairs, experiment), sorted(pairs.index.unique("task"), reverse=True)
+    variants = in_order(pairs, experiment)
+    variants = [name for name in variants if pairs.loc[name].index.unique("task").size >= LEAST] or variants
+    tasks = sorted(pairs.loc[variants].index.unique("task"), reverse=True)
     rows = {str(ENV_STEPS): f"return at {ENV_STEPS:,} env steps", "area": "area under the curve"}
     figure = Figure(figsize=(1.6 + 2.6 * len(variants), 2 * (0.26 * len(tasks) + 1.5)), layout="constrained")
     grid = figure.subplots(2, len(variants), squeeze=False, sharex="row", sharey=True)

@@ -96,6 +96,20 @@ def test_seeds_that_all_differ_alike_leave_no_doubt(script):
     assert script.interval_over_seeds(script.pd.Series(5.0, index)) == (5.0, 0.0)
 
 
+def test_the_figure_is_of_the_variants_that_were_run_on_several_tasks(script):
+    def panels(**tasks: list[str]) -> list[str]:
+        runs = [(name.replace("_", " "), task, 1) for name, each in tasks.items() for task in each]
+        columns = [f"{part} {column}" for part in ("variant", "base") for column in script.COLUMNS]
+        pairs = script.pd.DataFrame(0.0, script.pd.MultiIndex.from_tuples(runs), columns)
+        pairs.index.names = ["variant", "task", "seed"]
+        figure = script.draw(pairs, script.read_experiment(script.file_of("cpu-ablation")))
+        return [axis.get_title() for axis in figure.axes[: len(figure.axes) // 2]]
+
+    three = ["walker-run", "hopper-stand", "cheetah-run"]
+    assert panels(one_head=["fish-swim"], final_depth=three, UTD_2=three[:2]) == ["final depth"]
+    assert panels(one_head=["fish-swim"], UTD_2=three[:2]) == ["one head", "UTD 2"]
+
+
 def test_what_is_kept_of_the_experiment_s_runs_leaves_out_what_is_kept_elsewhere(script, tmp_path):
     write(tmp_path / "walker-run" / "seed1", dict.fromkeys(script.STEPS, 1.0))
     for variant in ("cpu", "no reanalyze"):
