@@ -241,16 +241,18 @@ class ReanalyzeTransform(Transform):
         with set_exploration_type(ExplorationType.RANDOM):
             planned = self.planner(states)
         planned = planned.select(*self.plan_keys.values()).to(observation.device)
-        versions = tensordict.get(self.plan_keys[VERSION])[:rows]
-        age = planned.get(self.plan_keys[VERSION]).reshape(versions.shape) - versions
-        self.target_age = age.float().mean()
-        patch = {key: planned.get(key)[original] for key in self.plan_keys.values()}
+        held = {key: tensordict.get(key) for key in self.plan_keys.values()}
+        # Rows may hold numbers [B] for the planner's [B, 1].
+        fresh = {key: planned.get(key).reshape(old[:rows].shape) for key, old in held.items()}
+        version = self.plan_keys[VERSION]
+        self.target_age = (fresh[version] - held[version][:rows]).float().mean()
+        patch = {key: new[original] for key, new in fresh.items()}
         result = buffer.update_if_present(index=index, generation=generation, patch=patch)
         self.refreshed += result.updated_count
         self.stale += result.stale_count
         for key, value in patch.items():
-            stored = tensordict.get(key).clone()
-            stored[:rows] = value.reshape(stored[:rows].shape)  # rows may hold numbers [B] for the planner's [B, 1]
+            stored = held[key].clone()
+            stored[:rows] = value
             tensordict.set(key, stored)
         # Rows beyond the first slices may be copies of re-planned ones; they keep their old target in this batch.
         return tensordict

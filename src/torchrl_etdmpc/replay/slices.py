@@ -302,12 +302,6 @@ class StepSliceSampler(Sampler):
                 "environments writes by itself, Collector(..., postproc=lambda batch: batch.reshape(-1))."
             )
         keys = self._id_keys(stored)
-        others = [key for key in keys if not isinstance(stored.get(key), Tensor)]
-        if others:
-            raise TypeError(
-                f"StepSliceSampler tells episodes apart by whole numbers, got texts or a dictionary at "
-                f"{', '.join(map(repr, others))}; number the episodes in every row and pass that key as traj_key=..."
-            )
         if self.partial and stored.get(self.done_key, None) is None:
             raise KeyError(
                 f"partial=True needs {self.done_key!r} in every row, to know which episodes have ended; store it, or "
@@ -320,6 +314,11 @@ class StepSliceSampler(Sampler):
         values: dict[NestedKey, Any] = {}
         for key in (*keys, self.init_key, self.done_key, self.mask_key):
             column = stored.get(key, None)
+            if key in keys and not isinstance(column, Tensor):
+                raise TypeError(
+                    f"StepSliceSampler tells episodes apart by whole numbers, got texts or a dictionary at {key!r}; "
+                    "number the episodes in every row and pass that key as traj_key=..."
+                )
             if column is not None:
                 column = column[index].reshape(number, -1)
                 # Joined to one table below, where a single float32 column would round the ids of the others.
