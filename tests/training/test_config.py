@@ -379,6 +379,14 @@ REFUSED_AT_ONCE = [
     ),
     ({"reanalyze__every": -1}, "reanalyze.every must not be negative, got -1."),
     *(
+        (
+            {"model__num_dynamics": 1, "model__num_values": 1, f"{group}__{name}": 2.0},
+            f"{group}.{name} has no effect with one dynamics head and one value head, got 2.0; set it to 0, or raise "
+            "model.num_dynamics or model.num_values.",
+        )
+        for group, name in (("planner", "beta"), ("reanalyze", "beta"), ("loss", "value_beta"))
+    ),
+    *(
         ({f"loss__{name}_coef": -1.0}, f"loss.{name}_coef must not be negative, got -1.0.")
         for name in ("consistency", "reward", "value", "termination", "entropy")
     ),
@@ -583,6 +591,9 @@ def build(config: TrainConfig) -> None:
         {"planner__std_min": 2.0},
         {"planner__beta": -1.0},  # optimism
         {"reanalyze__every": 0},
+        {"model__num_dynamics": 1, "model__num_values": 1, "reanalyze__every": 0, "reanalyze__beta": 2.0},
+        {"model__num_dynamics": 1, "planner__beta": 2.0, "loss__value_beta": 2.0},
+        {"model__num_values": 1, "planner__beta": 2.0, "loss__value_beta": 2.0},
         {"loss__slice_len": 500},
         {"total_env_steps": 5001},
         {"replay__capacity": 6},

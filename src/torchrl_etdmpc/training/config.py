@@ -298,6 +298,15 @@ class TrainConfig:
             "eval_episodes": MOST_EPISODES,
         }.items():  # each is one in memory
             require((getattr(self, name) or 0) <= most, f"{name} must be at most {most}, got {getattr(self, name)}.")
+        betas = {"planner.beta": self.planner.beta, "loss.value_beta": self.loss.value_beta}
+        if self.reanalyze.every:
+            betas["reanalyze.beta"] = self.reanalyze.beta
+        for name, beta in betas.items():
+            require(
+                not beta or (self.model.num_dynamics, self.model.num_values) != (1, 1),
+                f"{name} has no effect with one dynamics head and one value head, got {beta}; set it to 0, or raise "
+                "model.num_dynamics or model.num_values.",
+            )
         self._check_against_the_episode(self.task_spec)
 
     def _check_against_the_episode(self, task: Task) -> None:
