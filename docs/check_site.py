@@ -2,9 +2,9 @@
 
     python docs/check_site.py build/docs/html [--screenshots FOLDER]
 
-Every page, at 390 and 1280 pixels: nothing on the console, no request to another host, every image there, nothing wider
-than the window, every link within the site leads somewhere, and a block of code is copied by its button. The API pages
-hold every public name. Without a Chromium it says so and checks names and links alone.
+Every page, made 390 and 1280 pixels wide: nothing on the console, no request to another host, every image there,
+nothing wider than the window, every link within the site leads somewhere, and a block of code is copied by its button.
+The API pages hold every public name. Without a Chromium it says so and checks names and links alone.
 """
 
 from __future__ import annotations
@@ -119,14 +119,15 @@ def _chromium() -> str | None:
 
 
 LOOK = """
-const wide = document.documentElement.scrollWidth - window.innerWidth;
+const width = document.documentElement.clientWidth;  // a phone's innerWidth grows with what is too wide
+const wide = document.documentElement.scrollWidth - width;
 const missing = image => !image.complete || image.naturalWidth === 0;
 const images = [...document.images].filter(missing).map(image => image.src);
 let widest = '';
 if (wide > 0) {
   for (const element of document.querySelectorAll('article *')) {
     const right = element.getBoundingClientRect().right;
-    if (right > window.innerWidth + 1 && !element.closest('.table-wrapper, pre, .formula'))
+    if (right > width + 1 && !element.closest('.table-wrapper, pre, .formula'))
       { widest = element.tagName + '.' + element.className + ' ' + element.textContent.slice(0, 40); break; }
   }
 }
@@ -152,26 +153,19 @@ def walk(site: Path, screenshots: Path | None = None) -> list[str]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         driver = _driver(profile)
         try:
-            for width in WIDTHS:
-                driver.execute_cdp_cmd(
-                    "Emulation.setDeviceMetricsOverride",
-                    {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600},
-                )
-                for page in pages_of(site):
-                    name = str(page.relative_to(site))
-                    driver.get(base + urllib.parse.quote(name))
+            for page in pages_of(site):
+                name = str(page.relative_to(site))
+                driver.get(base + urllib.parse.quote(name))
+                for width in WIDTHS:
+                    driver.execute_cdp_cmd(
+                        "Emulation.setDeviceMetricsOverride",
+                        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600},
+                    )
                     seen = driver.execute_script(LOOK)
                     where = f"{name} at {width}"
                     if seen["wide"] > 0:
                         faults.append(f"{where}: {seen['wide']} px wider than the window ({seen['widest']})")
                     faults += [f"{where}: {image} does not load" for image in seen["images"]]
-                    faults += [f"{where}: {entry['message']}" for entry in driver.get_log("browser")]
-                    for entry in driver.get_log("performance"):
-                        message = json.loads(entry["message"])["message"]
-                        if message["method"] == "Network.requestWillBeSent":
-                            url = message["params"]["request"]["url"]
-                            if not url.startswith((base, "data:", "about:", "chrome", "blob:")):
-                                faults.append(f"{where}: asks for {url}")
                     if driver.execute_script("return document.querySelector('button.copybtn') !== null"):
                         if driver.execute_script(COPY):
                             copied += 1
@@ -181,9 +175,17 @@ def walk(site: Path, screenshots: Path | None = None) -> list[str]:
                         screenshots.mkdir(parents=True, exist_ok=True)
                         target = screenshots / f"{width}-{name.replace('/', '_')}.png"
                         driver.save_screenshot(str(target))
+                faults += [f"{name}: {entry['message']}" for entry in driver.get_log("browser")]
+                for entry in driver.get_log("performance"):
+                    message = json.loads(entry["message"])["message"]
+                    if message["method"] == "Network.requestWillBeSent":
+                        url = message["params"]["request"]["url"]
+                        if not url.startswith((base, "data:", "about:", "chrome", "blob:")):
+                            faults.append(f"{name}: asks for {url}")
         finally:
             driver.quit()
             server.shutdown()
+            server.server_close()
     if not copied:
         faults.append("no block of code can be copied")
     return faults

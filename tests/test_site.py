@@ -350,15 +350,58 @@ def test_the_build_stops_at(file, old, new, said, tmp_path):
     assert said in done.stderr + done.stdout
 
 
-def test_dead_links_and_undocumented_names_of_a_built_site_are_found(tmp_path):
+@pytest.fixture(scope="module")
+def check_site():
     sys.path.insert(0, str(DOCS))
     try:
-        check_site = importlib.import_module("check_site")
+        yield importlib.import_module("check_site")
     finally:
         sys.path.remove(str(DOCS))
+
+
+def test_dead_links_and_undocumented_names_of_a_built_site_are_found(tmp_path, check_site):
     (tmp_path / "a.html").write_text('<a href="b.html#here">x</a> <a href="gone.html">y</a> <img src="no.png">')
     (tmp_path / "b.html").write_text(
         '<p id="there">z</p><a href="a.html">back</a> <a href="https://example.com">out</a>'
     )
     found = check_site.dead_links(tmp_path)
     assert [fault.split(": ")[1].split(" ")[0] for fault in found] == ["b.html#here", "gone.html", "no.png"]
+
+
+PAGE = """<!doctype html><html><head><meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,"></head><body><article>{}</article></body></html>"""
+
+
+@pytest.mark.slow
+def test_a_walk_through_the_site_finds_what_a_reader_would(tmp_path, check_site):
+    pytest.importorskip("selenium")
+    if not (check_site._chromium() and shutil.which("chromedriver")):
+        pytest.skip("needs chromium and chromedriver: apt-get install chromium chromium-driver")
+    button = '<button class="copybtn" onclick="{}">copy</button>'
+    pages = {
+        "a_good": button.format("navigator.clipboard.writeText('x')"),
+        "b_wide": '<div style="width: 600px">a table</div>',
+        "c_wider": '<div style="width: 1500px">a picture</div>',
+        "d_dead": button.format(""),
+        "e_lost": '<img src="no.png">',
+        "f_loud": '<script>console.error("boom"); fetch("http://localhost:1/x").catch(() => 0)</script>',
+    }
+    for name, body in pages.items():
+        (tmp_path / f"{name}.html").write_text(PAGE.format(body))
+    found = [fault.replace("\n", " ") for fault in check_site.walk(tmp_path)]
+    expected = [
+        r"b_wide\.html at 390: \d+ px wider than the window \(DIV\. a table\)",
+        r"c_wider\.html at 390: \d+ px wider than the window \(DIV\. a picture\)",
+        r"c_wider\.html at 1280: \d+ px wider than the window \(DIV\. a picture\)",
+        r"d_dead\.html at 390: the button copies nothing",
+        r"d_dead\.html at 1280: the button copies nothing",
+        r"e_lost\.html at 390: .*no\.png does not load",
+        r"e_lost\.html at 1280: .*no\.png does not load",
+        r"e_lost\.html: .*no\.png - Failed to load resource.*",
+        r'f_loud\.html: .*"boom"',
+        r"f_loud\.html: .*http://localhost:1/x.*",
+        r"f_loud\.html: asks for http://localhost:1/x",
+    ]
+    assert len(found) == len(expected), found
+    for fault, pattern in zip(found, expected, strict=True):
+        assert re.fullmatch(pattern, fault), fault
