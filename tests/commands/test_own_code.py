@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from torchrl_etdmpc import training
 from torchrl_etdmpc.commands import evaluate, export, inspect_planner, study, train
 from torchrl_etdmpc.training import TrainConfig, build_agent, load_agent, save_agent
 
@@ -143,6 +145,19 @@ def test_a_configuration_with_a_path_that_nobody_followed_is_refused():
     for values in ({"planner": {"score": "os:getcwd"}}, {"loss": {"extra_terms": "os:getcwd"}}):
         with pytest.raises(ValueError, match=r"'os:getcwd' names code, which must be given on the command line"):
             TrainConfig.from_dict({"preset": "cpu", **values})
+
+
+def test_a_configuration_with_a_path_is_made_in_python_after_the_call_that_its_error_names(monkeypatch):
+    monkeypatch.setattr("torchrl_etdmpc.training.own_code._followed", {})
+    values = {"preset": "cpu", "planner": {"score": "os:getcwd"}}
+    with pytest.raises(ValueError) as caught:
+        TrainConfig.from_dict(values)
+    named = re.search(
+        r"In Python, call torchrl_etdmpc\.training\.(follow_own_code)\('(.*)', '(.*)'\) before\.$", str(caught.value)
+    )
+    assert named is not None
+    getattr(training, named[1])(named[2], named[3])
+    assert TrainConfig.from_dict(values).planner.score == "os:getcwd"
 
 
 def test_they_cost_few_lines():

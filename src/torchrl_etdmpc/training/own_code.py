@@ -54,6 +54,7 @@ def own_code(setting: str, path: str) -> Callable[..., Any]:
         short = next(name for name, meant in reversed(OWN_CODE.items()) if meant == setting)
         raise ValueError(
             f"{setting} {path!r} names code, which must be given on the command line: {setting}={path} to train, "
-            f"{short}={path} with an agent file, code={path} of a suite."
+            f"{short}={path} with an agent file, code={path} of a suite. In Python, call "
+            f"torchrl_etdmpc.training.follow_own_code({setting!r}, {path!r}) before."
         )
     return _followed[setting, path]
