@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from cpu_learning import RESULTS, ROOT, TASKS
+from cpu_learning import RESULTS, ROOT, TASKS, half_interval
 from matplotlib.figure import Figure
 from scipy.stats import t as student
 
@@ -116,16 +116,9 @@ def interval(differences: pd.Series) -> tuple[float, float]:
 
 
 def interval_over_seeds(differences: pd.Series) -> tuple[float, float]:
-    """Mean over tasks and half of its 95% interval over seeds of these tasks, several of each.
-
-    Tasks have their own variances, so the degrees of freedom are those of Welch and Satterthwaite.
-    """
+    """Mean over tasks and half of its 95% interval over seeds of these tasks, several of each."""
     tasks = differences.groupby("task").agg(["mean", "var", "count"])
-    mean, shares = tasks["mean"].mean(), tasks["var"] / tasks["count"]
-    if not shares.any():
-        return mean, 0.0
-    freedom = shares.sum() ** 2 / (shares**2 / (tasks["count"] - 1)).sum()
-    return mean, student.ppf(0.975, freedom) * shares.sum() ** 0.5 / len(tasks)
+    return tasks["mean"].mean(), half_interval(tasks["var"] / tasks["count"], tasks["count"])
 
 
 def written(mean: float, half: float) -> str:

@@ -24,9 +24,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from scipy.stats import t as student
 
 from torchrl_etdmpc.analysis import get_benchmark, read_runs
-from torchrl_etdmpc.analysis.statistics import Z_95
 from torchrl_etdmpc.envs import DMC_TASKS
 from torchrl_etdmpc.runs import RunDirectory
 
@@ -97,6 +97,22 @@ def write_report(tasks: Sequence[str], out: Path) -> None:
     subprocess.run(command, check=True)
 
 
+def half_interval(shares: pd.Series, counts: pd.Series) -> float:
+    """Half of the 95% interval over seeds of a mean over tasks.
+
+    Tasks have their own variances, so the degrees of freedom of Student's t are those of Welch and Satterthwaite.
+
+    Args:
+        shares (Series): by task, the squared standard error of its mean; the interval is NaN if one is not known.
+        counts (Series): by task, the seeds of that mean.
+    """
+    total = shares.sum(skipna=False)
+    if total == 0:
+        return 0.0
+    freedom = total**2 / (shares**2 / (counts - 1)).sum(skipna=False)
+    return student.ppf(0.975, freedom) * total**0.5 / len(shares)
+
+
 def beside_baselines(returns: pd.DataFrame) -> list[str]:
     """Means over the tasks that the preset was tuned on, over the others and over all, as lines of Markdown.
 
@@ -120,7 +136,7 @@ def beside_baselines(returns: pd.DataFrame) -> list[str]:
             if len(own) < group["task"].nunique():
                 cells.append("–")
                 continue
-            mean, half = own["mean"].mean(), Z_95 * own["standard_error"].pow(2).sum(skipna=False) ** 0.5 / len(own)
+            mean, half = own["mean"].mean(), half_interval(own["standard_error"].pow(2), own["seeds"])
             cell = f"{'≈ ' if own['kind'].eq('interpolated').any() else ''}{mean:.0f}"
             cells.append(cell if pd.isna(half) else f"{cell} [{mean - half:.0f}, {mean + half:.0f}]")
             place = -mean  # ends as that over all tasks at the last step

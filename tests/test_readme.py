@@ -225,6 +225,9 @@ def test_the_means_of_the_readme_are_those_of_the_table():
     figure = table["TD-MPC2 (EZ-V2's figure)"]["50,000", "tuned"]
     told = f"On the six tuned tasks TD-MPC2 has {figure} at 50,000 env steps, read off a figure"
     assert told in " ".join(page.split())
+    (row,) = re.findall(r"^\| \*\*cpu\*\* \|.*\[.*$", TEXTS["docs/results.md"], re.M)
+    tuned, others, every, *_, at_end = (" to ".join(ends) for ends in re.findall(r"\[(\d+), (\d+)\]", row))
+    assert f"row by row, {every}, {tuned}, {others} and {at_end}." in " ".join(page.split())
 
 
 def test_the_means_with_former_settings_are_those_that_are_committed():

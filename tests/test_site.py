@@ -205,27 +205,31 @@ def test_means_beside_baselines_are_over_the_tasks_that_were_run(monkeypatch):
     pd = pytest.importorskip("pandas")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     beside_baselines = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))["beside_baselines"]
+    values, whole = (("walker-walk", 100), ("cup-catch", 300), ("walker-run", 50)), (10, 20, 30)
     evaluated = [
-        *(("cpu", task, value, None) for task, value in (("walker-walk", 100), ("cup-catch", 300), ("walker-run", 50))),
-        *(("whole", task, value, 10) for task, value in (("walker-walk", 10), ("cup-catch", 20), ("walker-run", 30))),
-        ("lacks one", "walker-run", 60, 5),
-        ("whole", "fish-swim", 999, 1),  # which the preset was not run on
+        *(("cpu", task, value, None, 1) for task, value in values),
+        *(("whole", task, value, 10, 3) for (task, _), value in zip(values, whole, strict=True)),
+        *(("settled", task, 7, 0, 3) for task, _ in values),
+        ("lacks one", "walker-run", 60, 5, 3),
+        ("whole", "fish-swim", 999, 1, 3),  # which the preset was not run on
     ]
     rows = [("evaluated", 1, 50_000, *row) for row in evaluated]
-    rows += [("quoted", 1, 50_000, "paper", task, 40, None) for task in ("walker-walk", "cup-catch", "walker-run")]
+    rows += [("quoted", 1, 50_000, "paper", task, 40, None, None) for task, _ in values]
     rows += [
-        ("interpolated", 1, 100_000, "whole", "walker-run", 7, 2),
-        ("evaluated", 1, 100_000, "cpu", "walker-run", 8, None),
+        ("interpolated", 1, 100_000, "whole", "walker-run", 7, 2, 5),
+        ("evaluated", 1, 100_000, "cpu", "walker-run", 8, None, 1),
     ]
-    rows += [("evaluated", 3, 50_000, "cpu", "Mean over tasks", 999, None)]
-    columns = ["kind", "tasks", "env_steps", "method", "task", "mean", "standard_error"]
+    rows += [("evaluated", 3, 50_000, "cpu", "Mean over tasks", 999, None, 1)]
+    columns = ["kind", "tasks", "env_steps", "method", "task", "mean", "standard_error", "seeds"]
+    # Student's t of 2, 4 and 6 degrees of freedom: 4.303, 2.776 and 2.447.
     assert beside_baselines(pd.DataFrame(rows, columns=columns)) == [
         "| mean return at | 50,000: 2 tuned | 50,000: 1 others | 50,000: 3 all | 100,000: 1 others | 100,000: 1 all |",
         "|---|---|---|---|---|---|",
         "| **cpu** | 200 | 50 | 150 | 8 | 8 |",
-        "| whole | 15 [1, 29] | 30 [10, 50] | 20 [9, 31] | ≈ 7 [3, 11] | ≈ 7 [3, 11] |",
-        "| lacks one | – | 60 [50, 70] | – | – | – |",
+        "| whole | 15 [-5, 35] | 30 [-13, 73] | 20 [6, 34] | ≈ 7 [1, 13] | ≈ 7 [1, 13] |",
+        "| lacks one | – | 60 [38, 82] | – | – | – |",
         "| paper (quoted) | 40 | 40 | 40 | – | – |",
+        "| settled | 7 [7, 7] | 7 [7, 7] | 7 [7, 7] | – | – |",
     ]
 
 
@@ -264,6 +268,26 @@ def test_the_tables_beside_baselines_are_those_of_the_committed_report(monkeypat
     page = script["PAGE"].read_text(encoding="utf-8")
     for lines in (script["beside_baselines"](returns), script["by_task"](returns, curves)):
         assert "-->\n" + "\n".join(lines) + "\n<!-- end -->" in page
+
+
+def test_means_with_intervals_on_the_pages_are_of_the_committed_runs(monkeypatch):
+    pytest.importorskip("pandas")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    script = runpy.run_path(str(ROOT / "benchmarks" / "cpu_learning.py"))
+
+    def mean(folder: str, tasks: tuple[str, ...], env_steps: int) -> str:
+        curves = script["read_runs"](script["RESULTS"] / folder / task for task in tasks)
+        seeds = curves[curves["env_steps"] == env_steps].groupby("task")["return_mean"].agg(["mean", "var", "count"])
+        value, half = seeds["mean"].mean(), script["half_interval"](seeds["var"] / seeds["count"], seeds["count"])
+        assert set(seeds["count"]) == {3}
+        return f"{value:.0f} [{value - half:.0f}, {value + half:.0f}]"
+
+    page = script["PAGE"].read_text(encoding="utf-8")
+    assert f"at 100,000 env steps is {mean('', script['get_benchmark']('dmc-hard').tasks, 100_000)}" in page
+    former = {name: mean(name, script["TASKS"], 50_000) for name in ("imagined", "bins-101", "width-64")}
+    assert [name for name, value in former.items() if value not in page] == []
+    width = (ROOT / "docs" / "studies" / "cpu-width.md").read_text(encoding="utf-8")
+    assert f"| mean of the six, 50,000 | {former['width-64']} | {former['bins-101']} |" in width
 
 
 def test_the_commands_explain_themselves(generate):
