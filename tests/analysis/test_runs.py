@@ -294,6 +294,13 @@ def test_rows_with_more_cells_than_the_header_are_refused_and_not_shifted(tmp_pa
         read_run(run)
 
 
+@pytest.mark.parametrize("cut", ["1000,500,250,12.5,3", "1000,500,250,12.5,300.5,0.5", "1000,500", "1000"])
+def test_a_row_that_was_cut_is_refused_and_no_return_is_made_of_what_is_left(tmp_path, cut):
+    run = make_run(tmp_path / "run", HEADER + line(0, 1.0) + cut + "\n\n" + line(2000, 400.5))
+    with pytest.raises(ValueError, match=f"eval.csv has a row with fewer cells than its header, '{re.escape(cut)}'"):
+        read_run(run)
+
+
 def test_a_run_without_configuration_and_summary_is_an_error(tmp_path):
     run = make_run(tmp_path / "run", HEADER)
     (run / "config.yaml").unlink()

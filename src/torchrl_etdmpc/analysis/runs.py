@@ -214,7 +214,14 @@ def read_evaluations(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
     if not file.is_file():
         raise FileNotFoundError(f"{run_dir} has no {file.name}, which holds the evaluations of a run.")
     text = file.read_text(encoding="utf-8", errors="replace")
-    table = parse_table(text[: text.rfind("\n") + 1], file, ("env_steps", "return_mean"), empty=True)
+    text = text[: text.rfind("\n") + 1]
+    header, *rows = [line for line in text.split("\n") if line.strip()] or [""]
+    for row in rows:  # what is left of its last number may look like one
+        if row.count(",") < header.count(","):
+            raise ValueError(
+                f"{file} has a row with fewer cells than its header, {row.strip()!r}; remove what was cut."
+            )
+    table = parse_table(text, file, ("env_steps", "return_mean"), empty=True)
     return table.drop_duplicates("env_steps", keep="last").sort_values("env_steps", ignore_index=True)
 
 
