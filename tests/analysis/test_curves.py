@@ -71,6 +71,8 @@ def test_a_baseline_with_a_header_only_has_no_rows(tmp_path, header):
         ),
         (AS_MEANS + "a,walker-run,0,high,1,2\n", "column mean must hold numbers"),
         (AS_MEANS + "a,walker-run,0,3,low,2\n", "column standard_error must hold numbers"),
+        (AS_MEANS + "a,walker-run,0,3,-1,2\n", "standard_error is at least 0, seeds at least 1; leave empty"),
+        (AS_MEANS + "a,walker-run,0,3,,\na,walker-run,10,3,1,0\n", "standard_error is at least 0, seeds at least 1"),
         (PER_SEED + "a,walker-run,1,0,high\n", "column return_mean must hold numbers"),
         (PER_SEED + "a,walker-run,1,0,inf\n", "column return_mean must hold finite numbers"),
         (PER_SEED + "a,walker-run,1,0,-inf\n", "column return_mean must hold finite numbers"),

@@ -60,6 +60,8 @@ def read_curves(file: str | os.PathLike[str]) -> pd.DataFrame:
     else:
         raise ValueError(f"{file} has neither the columns seed, return_mean (one row per seed) nor mean; add them.")
     make_numbers(table, numbers, file)
+    if "seeds" in numbers and ((table["standard_error"] < 0) | (table["seeds"] < 1)).any():
+        raise ValueError(f"{file}: standard_error is at least 0, seeds at least 1; leave empty what is not known.")
     check_units(table, file)
     refuse_doubles(table, key, file)
     return table[list(columns)].sort_values(key, ignore_index=True)
