@@ -5,8 +5,8 @@
 Plays episodes from the last checkpoint of every run: with the planner as the run evaluates it, with one change to it at
 a time, and with the policy alone. All play the same starts, which no evaluation of a run has. Writes a row per run,
 whose directory is named as seen from the table's, and setting; an ``--out`` that is there already is gone on with, if
-all of its rows are of these runs. Then prints what each change does to the return: its mean over agents and a 95%
-interval (t).
+all of its rows are of these runs. Then prints what each change does to the return: its mean over tasks and a 95%
+interval (t over tasks, whose agents are no independent samples).
 """
 
 from __future__ import annotations
@@ -91,14 +91,18 @@ def measure(runs: list[RunDirectory], settings: list[str], episodes: int, out: P
 
 
 def effects(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean over agents of the return's difference from that of the planner as trained, with a 95% interval."""
+    """Mean over tasks of the return's difference from that of the planner as trained, with a 95% interval (t).
+
+    A task counts by the mean of its agents, of those alone that have both returns.
+    """
     returns = table.pivot(index=["task", "seed"], columns="setting", values="return_mean")
     rows = []
     for setting in (name for name in CHANGES if name in returns):
         pairs = (returns[setting] - returns[AS_TRAINED]).dropna()
-        half = stats.t.ppf(0.975, len(pairs) - 1) * pairs.sem() if len(pairs) > 1 else float("nan")
-        mean = pairs.mean()
-        rows.append([setting, len(pairs), returns[setting].mean(), mean, mean - half, mean + half, (pairs > 0).sum()])
+        tasks = pairs.groupby("task").mean()
+        half = stats.t.ppf(0.975, len(tasks) - 1) * tasks.sem() if len(tasks) > 1 else float("nan")
+        mean, by_task = tasks.mean(), returns.loc[pairs.index, setting].groupby("task").mean()
+        rows.append([setting, len(pairs), by_task.mean(), mean, mean - half, mean + half, (pairs > 0).sum()])
     return pd.DataFrame(rows, columns=["setting", "agents", "return", "difference", "low", "high", "higher"])
 
 
