@@ -177,6 +177,14 @@ def test_a_helper_that_fails_does_so_in_silence_and_leaves_its_parts_to_this_pro
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_helper_imports_nothing_of_the_folder_that_the_run_was_begun_in(monkeypatch, tmp_path):
+    (tmp_path / "mine.py").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(precompile, "_HELP", "import mine")
+    with precompile._helper(("a", "request")) as helper:
+        assert helper.wait(60) == 1
+
+
 def test_a_helper_ends_with_the_one_that_it_helps(tiny_config):
     with pytest.raises(KeyboardInterrupt), precompile._helper((tiny_config(), 5, 1, (1,), (2,), [])) as helper:
         raise KeyboardInterrupt

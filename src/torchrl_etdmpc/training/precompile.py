@@ -90,7 +90,9 @@ def _helper(request: tuple[object, ...]) -> Iterator[subprocess.Popen[bytes]]:
     """A silent process that compiles some parts; what it does not manage to compile is left to this one."""
     settings = torch.get_num_threads(), torch.get_float32_matmul_precision()  # the cache goes by them too
     silent = subprocess.DEVNULL
-    process = subprocess.Popen([sys.executable, "-c", _HELP], stdin=subprocess.PIPE, stdout=silent, stderr=silent)
+    # -P: -c would import a random.py of the folder that the run was begun in.
+    line = [sys.executable, "-P", "-c", _HELP]
+    process = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=silent, stderr=silent)
     try:
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError), process.stdin:
