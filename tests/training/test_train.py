@@ -424,6 +424,13 @@ def test_a_run_of_many_failed_resets_keeps_all_of_its_rows_and_can_be_made_longe
     assert torch.equal(longer.learner.replay[:84]["observation"], first["observation"])
 
 
+def test_resets_that_fail_behind_finished_episodes_are_no_failures_in_a_row(tmp_path, tiny_config, make_run):
+    run = make_run(tiny_config(max_faults=2), tmp_path, CrashAtResets())
+    with pytest.warns(UserWarning, match=r"no room for another simulator; training goes on"):
+        assert run.run()["env_steps"] == 160
+    assert run.learner.faults == 4
+
+
 def test_a_run_that_went_on_after_too_many_failures_has_as_many_new_ones(tmp_path, tiny_config, make_run):
     config = tiny_config(max_faults=3, total_env_steps=90)
     run = make_run(config, tmp_path, Crash(33, 34, 35))

@@ -6,4 +6,10 @@ class NonFiniteError(RuntimeError):
 
 
 class SimulatorError(RuntimeError):
-    """The environment raised an exception."""
+    """The environment raised an exception.
+
+    Attributes:
+        episode_ended (bool): whether it did so in the reset behind an episode that ended and was stored.
+    """
+
+    episode_ended = False

@@ -211,26 +211,27 @@ class StepCollector(BaseCollector):
         try:
             return method(*args)
         except Exception as error:
-            self._store_before_reset(*args)
+            failure = SimulatorError(f"the environment failed at decision step {self._frames}: {first_line(error)}")
+            failure.episode_ended = self._store_before_reset(*args)
             self._truncate_episodes()
             with contextlib.suppress(Exception):  # then the next step fails as well, and the run ends after a few
                 start_workers_anew(self.env)
-            raise SimulatorError(
-                f"the environment failed at decision step {self._frames}: {first_line(error)}"
-            ) from error
+            raise failure from error
 
-    def _store_before_reset(self, acted: TensorDictBase | None = None) -> None:
+    def _store_before_reset(self, acted: TensorDictBase | None = None) -> bool:
         """Stores a step that was made where only the reset behind it failed, or ends of episodes would be lost.
 
         It is not counted, as a step that fails is not. Processes do not tell what they did before they failed.
         """
         if acted is None or acted.get(("next", "done"), None) is None or not acted["next", "done"].any():
-            return
+            return False
         kept = acted.exclude(*self.exclude_keys)
         values = (acted.get(key, None) for key in self._checked_after)
         finite = all(value is not None and bool(value.isfinite().all()) for value in values)
-        if finite and self._schema.get(self.in_seed_phase) in (None, set(kept.keys(True, True))):
+        stored = finite and self._schema.get(self.in_seed_phase) in (None, set(kept.keys(True, True)))
+        if stored:
             self._store(kept, acted.get(TRAJECTORY))
+        return stored
 
     def _decide(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.in_seed_phase:

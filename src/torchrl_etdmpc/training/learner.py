@@ -145,6 +145,8 @@ class Learner:
             )
 
     def _count_fault(self, error: NonFiniteError | SimulatorError) -> None:
+        if isinstance(error, SimulatorError) and error.episode_ended:
+            self.faults_in_a_row = 0
         self.faults += 1
         self.faults_in_a_row += 1
         if self.faults_in_a_row >= self.config.max_faults:
