@@ -13,6 +13,7 @@ import pytest
 import torch
 import yaml
 from tensordict import TensorDict, TensorDictBase
+from torchrl import torchrl_logger
 from torchrl.envs import Transform
 
 pytest.importorskip("dm_control")
@@ -32,6 +33,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
     load_agent,
     preset,
 )
+from torchrl_etdmpc.training.train import _draw_curve  # noqa: E402
 
 EPISODE = 20  # decisions, of every run here
 
@@ -65,6 +67,16 @@ def test_a_run_directory_holds_what_it_should_and_nothing_else(finished):
     }
     assert {file for file in files if not file.startswith("checkpoints/replay/")} == expected
     assert any(file.startswith("checkpoints/replay/rows-") for file in files)
+
+
+def test_a_curve_that_cannot_be_drawn_is_a_line_in_the_log(monkeypatch, finished):
+    matplotlib = pytest.importorskip("matplotlib")
+    told = []
+    monkeypatch.setattr(torchrl_logger, "warning", told.append)
+    monkeypatch.setenv("PATH", "")
+    with matplotlib.rc_context({"text.usetex": True}):
+        _draw_curve(finished.run.log.directory)
+    assert told == ["curve.png was not drawn: Failed to process string with tex because latex could not be found"]
 
 
 def test_the_configuration_can_be_read_back(finished):

@@ -303,5 +303,5 @@ def _draw_curve(directory: RunDirectory) -> None:
         from torchrl_etdmpc.analysis import plot_run
 
         plot_run(directory.path)
-    except (ImportError, OSError, ValueError) as error:
-        torchrl_logger.warning(f"{directory.curve.name} was not drawn: {error}")
+    except Exception as error:  # a user's own matplotlibrc can make matplotlib raise anything, e.g. without LaTeX
+        torchrl_logger.warning(f"{directory.curve.name} was not drawn: {first_line(error)}")
