@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import ActionScaling, Compose, EnvBase, GymEnv, StepCounter, TransformedEnv
 
 from torchrl_etdmpc.checkpoints import CheckpointError, CheckpointStore
 from torchrl_etdmpc.collectors import StepCollector
@@ -314,6 +315,23 @@ def is_free(directory: RunDirectory) -> bool:
 
 
 needs_dm_control = pytest.mark.skipif(importlib.util.find_spec("dm_control") is None, reason="needs dm_control")
+
+
+def test_files_of_a_run_stay_where_they_were_named_if_an_environment_changes_the_directory(
+    monkeypatch, tmp_path, process, tiny_config
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+
+    def make(task: Task, *, device: torch.device | str) -> EnvBase:
+        os.chdir(tmp_path / "elsewhere")
+        return TransformedEnv(GymEnv("Pendulum-v1", device=device), Compose(ActionScaling(), StepCounter(EPISODE)))
+
+    register_task(Task("restless", "user", episode_length=EPISODE), make, replace=True)
+    config = tiny_config(task="restless", run_dir="run", episode_length=EPISODE, total_env_steps=40)
+    assert launch(config).endswith("curve, tables and checkpoint are in run")
+    assert RunDirectory(tmp_path / "run").finished
+    assert not any((tmp_path / "elsewhere").iterdir())
 
 
 @needs_dm_control

@@ -31,6 +31,9 @@ class RunDirectory:
     Args:
         path (str or Path): ``~`` is the home directory.
 
+    Keyword Args:
+        named (str, optional): what messages call it. Default: ``path``.
+
     Attributes:
         path (Path): the directory.
         config (Path): ``config.yaml``, the resolved configuration, written before anything else.
@@ -49,8 +52,9 @@ class RunDirectory:
     'eval.csv'
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, named: str | None = None) -> None:
         self.path = Path(path).expanduser()
+        self._named = str(self.path) if named is None else named
         self.config = self.path / "config.yaml"
         self.train = self.path / "train.csv"
         self.eval = self.path / "eval.csv"
@@ -67,7 +71,7 @@ class RunDirectory:
         self._made: list[Path] = []  # folders, the outermost first
 
     def __str__(self) -> str:
-        return str(self.path)
+        return self._named
 
     @property
     def holds_a_run(self) -> bool:

@@ -165,7 +165,9 @@ def launch(config: TrainConfig, explicit: Iterable[str] = ()) -> str:
 
 
 def _train(plan: Launch, stop: StopSignals) -> dict[str, Any]:
-    config, directory = plan.config, plan.directory
+    config = plan.config
+    # Absolute: the code of an environment may change the current directory.
+    directory = RunDirectory(plan.directory.path.absolute(), named=str(plan.directory))
     with contextlib.ExitStack() as stack:
         if config.threads is not None:
             stack.callback(torch.set_num_threads, torch.get_num_threads())  # a sweep's next run may leave them open
