@@ -324,6 +324,19 @@ def test_a_worker_whose_owner_was_killed_ends_without_a_word(monkeypatch):
     assert text.getvalue() == "a warning"
 
 
+def test_a_worker_that_writes_at_every_step_waits_for_its_owner_once_a_second(monkeypatch):
+    waits, clock = [], [7.0]
+    monkeypatch.setattr(multiprocessing.connection, "wait", lambda owners, patience: waits.append(patience))
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    stderr = SilentWithoutOwner(io.StringIO(), 0)
+    for step in range(3):
+        print("step", step, file=stderr)
+    assert waits == [0.05, *[0.0] * 11]
+    clock[0] += 1.5
+    stderr.write("a warning")
+    assert waits[12:] == [0.05]
+
+
 @pytest.fixture
 def copied(begin_in_copy: Callable[[Callable[[], None]], int]) -> Iterator[Callable[[Callable[[], None]], int]]:
     """Begins a function in a copy of this process, which ends with the test."""

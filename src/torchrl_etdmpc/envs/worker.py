@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
 import multiprocessing.connection
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing import resource_tracker
@@ -23,6 +25,8 @@ from torchrl_etdmpc.envs.seeding import seed_everything
 _PATIENCE_S = 300
 # How often a worker process looks for its owner after a signal to stop, in seconds.
 _GRACE_S = 10
+# How long a worker that writes waits for an owner that may just be going, and how often, in seconds.
+_GOING_S, _WAIT_EVERY_S = 0.05, 1.0
 # Signals to stop: of the keyboard, of SLURM and of Kubernetes, and of a terminal that is closed.
 STOP_SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP") if hasattr(signal, name)
@@ -128,11 +132,15 @@ class SilentWithoutOwner:
 
     def __init__(self, stream: TextIO, owner: int) -> None:
         self._stream, self._owner = stream, owner
+        self._waited = -math.inf
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        if multiprocessing.connection.wait([self._owner], 0.05):  # it may just be going
+        patience = 0.0
+        if time.monotonic() - self._waited > _WAIT_EVERY_S:  # a simulator may write at every step
+            self._waited, patience = time.monotonic(), _GOING_S
+        if multiprocessing.connection.wait([self._owner], patience):
             os._exit(1)
         return self._stream.write(text)
