@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -125,6 +126,14 @@ def folder(tmp_path, monkeypatch):
         del sys.modules["more_tasks"].gymnasium.registry["InAFile-v0"]
     for name in ("my_file", "more_tasks", "misses_one", "raises"):
         sys.modules.pop(name, None)
+
+
+def test_a_function_that_changes_the_directory_does_so_for_its_environments_alone(folder):
+    (folder / "my_file.py").write_text(_RECIPE.replace("    return", "    os.chdir('/')\n    return") + "import os\n")
+    import_task("my_file:make_my_env")
+    assert Path.cwd() == folder
+    make_env("my_file:make_my_env")
+    assert Path.cwd() == Path("/")
 
 
 def test_a_new_task_is_one_file_and_its_path(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import math
@@ -74,7 +75,8 @@ def import_task(
     else:
         maker = partial(_make_limited, found)
         _first_states.pop(path, None)
-        env = _call(found, path)
+        with contextlib.chdir("."):  # it may change to another directory, where a command's relative paths mean others
+            env = _call(found, path)
         repeat, limit = _action_repeat(env), _limit(env)
         if limit is None and "episode_length" not in told:
             raise ValueError(f"task {path!r} shows no time limit; give one in env steps: task.episode_length=")
