@@ -89,6 +89,35 @@ def test_a_signal_stops_every_run_which_goes_on_later(small, tmp_path, stand_in,
     assert {read_progress(run).state for run in runs} == {"finished"}
 
 
+def test_runs_are_asked_to_stop_before_a_second_signal_ends_the_suite(small, tmp_path, monkeypatch):
+    class Process:
+        told = 0
+
+        def terminate(self):
+            self.told += 1
+
+        def poll(self):
+            return None
+
+        def wait(self):
+            return 75
+
+    (run,) = small.experiment().runs(tmp_path)
+    queue, process, told = RunQueue([run]), Process(), []
+
+    def twice() -> set[str]:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+        return set()
+
+    monkeypatch.setattr(local, "start", lambda run, **places: process)
+    monkeypatch.setattr(queue, "to_be_stopped", twice)
+    monkeypatch.setattr(os, "_exit", lambda code: told.append((code, process.told)))
+    run_locally(queue, workers=1)
+    assert told == [(128 + signal.SIGINT, 1)]
+    assert process.told == 1
+
+
 def test_a_run_whose_trial_ended_early_is_asked_to_stop_once(small, tmp_path, monkeypatch):
     """Asked twice, it would leave without having saved itself."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -73,6 +73,7 @@ def run_locally(queue: RunQueue, *, workers: int | None = None, per_gpu: int = 1
     threads = max(cores // count, 1)
     with StopSignals() as stop:
         stop.nothing_to_save = False
+        stop.at_once = lambda: _tell(places)  # they are in sessions of their own, and would train on
         try:
             while not stop.requested and (queue.left or any(place.run for place in places)):
                 for place in places:
@@ -118,8 +119,12 @@ def _stop(places: Sequence[_Place], queue: RunQueue) -> None:
     """Asks every run to save itself and leave, and waits for it."""
     if places:
         queue.say(f"stopping: {len(places)} run{'s save themselves' if len(places) > 1 else ' saves itself'}")
-    for place in places:
-        place.tell()
+    _tell(places)
     for place in places:
         if place.process is not None:
             place.process.wait()
+
+
+def _tell(places: Iterable[_Place]) -> None:
+    for place in places:
+        place.tell()

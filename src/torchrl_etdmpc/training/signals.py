@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -37,6 +38,7 @@ class StopSignals:
     Attributes:
         requested (bool): whether a signal has come.
         nothing_to_save (bool): Default: ``True``.
+        at_once (callable): called before a second signal ends the process. Default: does nothing.
 
     >>> with StopSignals() as stop:
     ...     stop.requested
@@ -46,6 +48,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.requested = False
         self.nothing_to_save = True
+        self.at_once: Callable[[], None] = lambda: None
         self._asked = False
         self._before: dict[int, Any] = {}
 
@@ -76,6 +79,8 @@ class StopSignals:
         if self._asked and not hangup:
             with contextlib.suppress(OSError):  # Ctrl-C has ended a `tee` that read it
                 os.write(2, f"{name} again: stopping at once; the last checkpoint stays.\n".encode())
+            with contextlib.suppress(Exception):
+                self.at_once()
             os._exit(128 + number)
         self._asked |= not hangup
         if self.requested:
