@@ -141,6 +141,14 @@ def test_a_directory_that_holds_a_run_is_refused_and_not_touched(tmp_path, entry
     assert snapshot(tmp_path) == before
 
 
+@pytest.mark.parametrize("name", ["café".encode(), "café".encode("latin-1"), b"two words"])
+def test_a_configuration_may_name_a_folder_in_any_bytes(tmp_path, name):
+    directory = RunDirectory(tmp_path / os.fsdecode(name))
+    config = CONFIG | {"run_dir": str(directory)}
+    directory.begin(config)
+    assert directory.read_config() == config
+
+
 def test_a_configuration_that_yaml_cannot_hold_is_refused_before_anything_is_made(tmp_path):
     with pytest.raises(ValueError, match=r"^config must hold plain dicts, .*, got device\(type='cpu'\); convert it"):
         RunDirectory(tmp_path / "run").begin({"device": torch.device("cpu")})
