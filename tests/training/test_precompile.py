@@ -6,6 +6,8 @@ import pickle
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +16,7 @@ from torchrl.envs.utils import exploration_type
 
 from torchrl_etdmpc.objectives import Term
 from torchrl_etdmpc.testing import random_slices
-from torchrl_etdmpc.training import build_agent, build_replay, precompile
+from torchrl_etdmpc.training import DistributedConfig, build_agent, build_replay, precompile
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler"
@@ -189,6 +191,15 @@ def test_a_helper_ends_with_the_one_that_it_helps(tiny_config):
     with pytest.raises(KeyboardInterrupt), precompile._helper((tiny_config(), 5, 1, (1,), (2,), [])) as helper:
         raise KeyboardInterrupt
     assert helper.poll() is not None
+
+
+@pytest.mark.parametrize(("device", "acts"), [("cpu", True), ("cuda", False)])
+def test_a_learner_on_a_gpu_compiles_no_plans_of_its_workers(tiny_config, device, acts):
+    model = SimpleNamespace(observation_dim=5, action_dim=1)
+    agent: Any = SimpleNamespace(world_model=model, device=torch.device(device))
+    config = DistributedConfig.from_dict(tiny_config().to_dict())
+    assert ("act" in precompile._parts(config, agent, (), (1,))) == acts
+    assert "act" in precompile._parts(tiny_config(), agent, (), (1,))
 
 
 _FIND = """

@@ -19,6 +19,7 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl_etdmpc.runs import first_line, progress_bar, usable_cores
 from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
+from torchrl_etdmpc.training.distributed import DistributedConfig
 
 _HELP = "from torchrl_etdmpc.training.precompile import help_to_compile; help_to_compile()"
 
@@ -159,4 +160,7 @@ def _parts(
         if set(agent.loss.in_keys) <= set(made_up.keys(True, True)):
             agent.updater.warm_up(made_up)
 
-    return {"act": act, "reanalyze": reanalyze, "evaluate": evaluate, "update": update}
+    parts: dict[str, Callable[[], object]] = {"reanalyze": reanalyze, "evaluate": evaluate, "update": update}
+    # Workers plan on CPUs, for which a learner on one fills the cache.
+    elsewhere = isinstance(config, DistributedConfig) and device.type != "cpu"
+    return parts if elsewhere else {"act": act} | parts
