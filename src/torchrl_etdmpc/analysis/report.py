@@ -205,7 +205,7 @@ def _page(comparison: Comparison, files: dict[str, str], figures: Collection[str
         f"Budget {comparison.budget:,} environment steps; {scope}. {_GRID}: {grid[0]:,.0f} to "
         f"{grid[-1]:,.0f} every {grid[1] - grid[0]:,.0f} env steps, trapezoid rule, env steps in millions. "
         + normalised
-        + "In brackets: number of seeds of each figure. Best in bold, second best in italics. "
+        + "In brackets: number of seeds of each figure. Best in bold, second best in italics; equal ones share it. "
         "A dash is not evaluated: no value is made up before a method's first evaluation of the trained agent, beyond "
         "its last one, or for a task that it lacks.\n",
         _incomplete(incomplete),

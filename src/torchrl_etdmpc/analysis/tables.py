@@ -80,6 +80,8 @@ def to_csv(table: pd.DataFrame, seeds: pd.DataFrame, errors: pd.DataFrame) -> st
 def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, int] | int) -> str:
     """The table as Markdown: best bold, second best in italics, the number of seeds in brackets.
 
+    Equal values share a mark, two best ones leave no second best, and a value that stands alone in its row has none.
+
     Args:
         table (DataFrame): see :func:`result_table`; a dash marks an unavailable value.
         seeds (DataFrame): of the same shape; a question mark stands for an unknown number.
@@ -89,7 +91,7 @@ def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, i
     >>> print(to_markdown(table, table, digits=1).splitlines()[-1])
     | t | *1.0* (1) | **2.0** (2) |
     """
-    ranks = rank_methods(table)
+    ranks = table.rank(axis=1, method="min", ascending=False).where(table.count(axis=1) > 1)
     names = [escape(name) for name in table.columns]
     lines = ["| task | " + " | ".join(names) + " |", "|---" * (1 + len(table.columns)) + "|"]
     for task, row in table.iterrows():
@@ -99,7 +101,7 @@ def to_markdown(table: pd.DataFrame, seeds: pd.DataFrame, *, digits: dict[str, i
             if np.isnan(value):
                 cells.append(DASH)
                 continue
-            mark = {ranks.loc[task, "best"]: "**", ranks.loc[task, "second_best"]: "*"}.get(method, "")
+            mark = {1: "**", 2: "*"}.get(ranks.loc[task, method], "")
             count = seeds.loc[task, method]
             cells.append(f"{mark}{value:.{decimals}f}{mark} ({'?' if np.isnan(count) else int(count)})")
         lines.append(f"| {task} | " + " | ".join(cells) + " |")
