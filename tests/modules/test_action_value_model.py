@@ -72,6 +72,11 @@ def test_dropout_changes_the_logits_only_when_asked_for_and_each_head_by_itself(
     plain = model.value_head(latent, action)
     assert torch.equal(plain, model.value_head(latent, action))
     assert (model.value_head(latent, action, dropout=True) != plain).flatten(1).any(1).all()
+    with torch.no_grad():
+        for parameter in model.value_head.parameters():
+            parameter[1:] = parameter[0]
+    heads = model.value_head(latent, action, dropout=True)
+    assert (heads[1:] != heads[:-1]).flatten(1).any(1).all()
 
 
 def test_an_action_is_a_squashed_sample():
