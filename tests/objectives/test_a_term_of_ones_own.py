@@ -117,10 +117,12 @@ def test_a_reset_draws_new_weights_for_the_term_s_network(with_decoder):
 
 
 def test_torchrl_s_target_update_leaves_the_term_s_network_alone(with_decoder, slices, total):
-    update = SoftUpdate(with_decoder, tau=0.5)
+    update, weight = SoftUpdate(with_decoder, tau=0.5), with_decoder.reconstruction.decoder.weight
     total(with_decoder(slices)).backward()
-    assert with_decoder.reconstruction.decoder.weight.grad.any()
+    assert weight.grad.any()
+    before = weight.clone()
     update.step()
+    assert torch.equal(weight, before) and list(with_decoder.targets()) == ["value"]
 
 
 def test_a_term_reads_keys_of_its_own(make_loss, world_model, slices):

@@ -135,9 +135,12 @@ def test_a_batch_without_weights_gets_no_priority(loss, slices):
 
 
 def test_an_update_weighs_and_writes_priorities_too(make_loss, make_world_model):
-    updater, batch = Updater(make_loss("whole", make_world_model())), random_slices(5, 3)
-    out = updater.step(weighted(batch))
+    loss, batch = make_loss("whole", make_world_model()), random_slices(5, 3)
+    plain, expected = (loss(each.clone())["loss_reward"].detach() for each in (batch.clone(), weighted(batch)))
+    out = Updater(loss).step(batch)
     assert batch["td_error"].shape == (4, 3)
+    torch.testing.assert_close(out["loss_reward"], expected)
+    assert not torch.isclose(expected, plain)
     assert all(value.shape == () for value in out.values())
 
 
