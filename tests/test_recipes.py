@@ -189,7 +189,9 @@ def worst_head(returns: Tensor) -> Tensor:
 
 
 def test_a_new_score(tmp_path):
-    planner = EnsembleMPPIPlanner(LatentEnv(WorldModel(3, 1, latent_dim=8, mlp_dim=8)), horizon=2, score=worst_head)
+    model = WorldModel(3, 1, latent_dim=8, mlp_dim=8)
+    torch.nn.init.normal_(model.value_head.output.weight)  # new heads are 0, where every score is the same
+    planner = EnsembleMPPIPlanner(LatentEnv(model), horizon=2, score=worst_head)
     trace = planner.plan(torch.zeros(1, 3), trace=True).trace
     assert torch.equal(trace.scores, worst_head(trace.returns))
 
