@@ -187,6 +187,14 @@ def test_steps_that_do_not_follow_each_other_are_a_warning(kind):
     others = batch[torch.arange(len(batch)).roll(1)]
     with pytest.warns(UserWarning, match="the slices join rows of several episodes"):
         loss(torch.stack([batch[:, 0], others[:, 1], others[:, 2]], dim=1))
+    if kind != "pixels":  # which hold no other number than finite ones
+        state = ("observation", "state") if kind == "dictionary" else ("observation",)
+        batch[state][0, 1] += 1  # one entry is enough
+        with pytest.warns(UserWarning, match="the slices join rows of several episodes"):
+            loss(batch)
+        batch["next", *state][0, -1] = torch.nan
+        with pytest.raises(ValueError, match="is not finite at the last step of a slice"):
+            loss(batch)
 
 
 def test_masked_steps_count_for_nothing_whatever_they_show(kind):

@@ -156,6 +156,8 @@ def test_actions_beyond_what_planner_and_policy_know_are_a_warning(make_loss, sl
 @pytest.mark.parametrize("where", ["done", "last"])
 def test_a_next_observation_that_is_missing_at_the_end_of_a_slice_is_refused(make_loss, slices, where):
     loss = make_loss("model")
+    slices["observation"][0, 1] = slices["next", "observation"][0, 0] = float("nan")  # no hole, whatever it is
+    loss(slices)
     slices["next", "observation"][1, -1] = float("nan")
     slices["next", "done"] = torch.zeros_like(slices["next", "terminated"])
     slices["next", "done"][1, -1] = where == "done"
