@@ -178,6 +178,10 @@ def test_a_step_without_a_plan_has_no_error_and_moves_no_scale(make_loss, make_s
     torch.testing.assert_close(out["kl_scale"], expected)
     assert not out["loss_policy"][~planned].any()
     torch.testing.assert_close(out["loss_policy"][planned], errors[planned])
+    loss.kl_scale.fill_(1)
+    masked = loss(slices.clone().set(("collector", "mask"), torch.ones(slices.shape, dtype=torch.bool)))
+    for name in ("kl_scale", "policy_kl"):  # a mask says nothing of plans
+        torch.testing.assert_close(masked[name], out[name])
     policy = [*loss.world_model.policy.parameters()]
     found = torch.autograd.grad(out["loss_policy"].sum(), policy)
     slices["plan", "loc"][~planned], slices["plan", "scale"][~planned] = 0.5, 2.0
