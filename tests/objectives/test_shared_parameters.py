@@ -92,6 +92,15 @@ def test_the_updater_still_works_after_calls_and_a_cast(make_loss, slices):
     torch.testing.assert_close(loss.target_value_params["output", "bias"], before + 0.1)
 
 
+def test_what_a_target_follows_is_what_is_trained(make_loss):
+    loss = make_loss("value")
+    trained = list(loss.world_model.value_head.parameters())
+    assert {id(own) for _, own in loss.target_parameters()["value"]} == set(map(id, trained))
+    loss.world_model.value_head.output.requires_grad_(False)
+    trained = [parameter for parameter in trained if parameter.requires_grad]
+    assert {id(own) for _, own in loss.target_parameters()["value"]} == set(map(id, trained))
+
+
 def test_an_optimizer_step_on_the_loss_is_seen_by_the_world_model(
     loss, kind, world_model, networks, slices, total, owned
 ):

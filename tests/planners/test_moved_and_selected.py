@@ -110,6 +110,13 @@ def test_the_keys_of_a_planner_that_starts_cold_are_selected_in_silence():
     assert make_planner(warm_start=False).select_out_keys("action").out_keys == ["action"]
 
 
+def test_only_what_is_written_can_be_selected():
+    planner = make_planner(warm_start=False)
+    with pytest.raises(ValueError, match=r"^out_keys must be some of \['action', .*\], got \['torque'\]\.$"):
+        planner.select_out_keys("action", "torque")
+    assert planner.out_keys == make_planner(warm_start=False).out_keys
+
+
 def test_forward_takes_a_generator():
     planner, data = make_planner(), states()
     before = torch.get_rng_state()
@@ -144,11 +151,13 @@ def test_the_repr_says_how_the_planner_plans():
 
 def test_a_generator_draws_for_the_entries_whatever_the_batch_size_says():
     planner, data = make_planner(), states()
-    drawn = [
-        planner(TensorDict(data.to_dict(), batch_size=size), generator=torch.Generator().manual_seed(4))["action"]
-        for size in ([], data.batch_size)
-    ]
-    assert torch.equal(*drawn)
+    latents = data.exclude("observation").set("latent", planner.world_model.encode(data["observation"]))
+    for entries in (data, latents):
+        drawn = [
+            planner(TensorDict(entries.to_dict(), size), generator=torch.Generator().manual_seed(4))["action"]
+            for size in ([], data.batch_size)
+        ]
+        assert torch.equal(*drawn)
 
 
 def test_specs_follow_a_world_model_that_its_loss_casts_or_moves():

@@ -47,9 +47,13 @@ def test_the_first_reset_compares_environment_and_model():
 
 def test_transforms_that_come_after_the_primer_may_mend_the_environment():
     env = make_env(2.0)
-    planner = make_planner(env)
-    env = TransformedEnv(env.base_env, Compose(InitTracker(), planner.make_tensordict_primer(), ActionScaling()))
-    assert env.reset()["plan_mean"].shape == (2, 2)
+    primer, looked = make_planner(env).make_tensordict_primer(), []
+    check = primer.check
+    primer.check = lambda *arguments, **options: looked.append(1) or check(*arguments, **options)
+    env = TransformedEnv(env.base_env, Compose(InitTracker(), primer, ActionScaling()))
+    for _ in range(2):
+        assert env.reset()["plan_mean"].shape == (2, 2)
+    assert len(looked) == 1  # at the first reset, which is costly enough
 
 
 class Nested(EnvBase):
@@ -99,11 +103,12 @@ def test_where_episodes_end_in_a_nested_place_the_plan_begins_there():
 
 @pytest.mark.parametrize("states", [1, 2, 5])  # as many as the plan has steps, fewer and more
 def test_an_environment_of_any_batch_size_gets_a_plan_for_each_state(states):
-    model = WorldModel(3, 1, latent_dim=16, mlp_dim=16, encoder_dim=16)
+    model = WorldModel(3, 1, latent_dim=16, mlp_dim=16, encoder_dim=16).double()
     planner = EnsembleMPPIPlanner(LatentEnv(model), **BUDGET)
     env = TransformedEnv(LatentEnv(model), planner.make_tensordict_primer())
-    start = env.reset(TensorDict({"latent": model.encode(torch.randn(states, 3))}, [states]))
-    assert torch.equal(start["plan_mean"], torch.zeros(states, 2, 1))
+    start = env.reset(TensorDict({"latent": model.encode(torch.randn(states, 3).double())}, [states]))
+    assert start["plan_mean"].dtype == torch.float64
+    assert torch.equal(start["plan_mean"], torch.zeros(states, 2, 1).double())
     steps = env.rollout(3, planner, tensordict=start, auto_reset=False)
     assert torch.equal(steps["plan_mean"][:, 1:], steps["next", "plan_mean"][:, :-1])
 

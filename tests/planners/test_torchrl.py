@@ -178,6 +178,7 @@ def test_a_primer_alone_carries_the_plan(monkeypatch):
     env = TransformedEnv(LineTask(planner.world_model), Compose(StepCounter(4), planner.make_tensordict_primer()))
     calls = record_starts(monkeypatch, planner)
     env.rollout(10, planner, break_when_any_done=False)
+    assert len(calls) == 10
     for step, (carried, _) in enumerate(calls):
         assert torch.equal(carried, calls[step - 1][1] if step % 4 else torch.zeros(3, 1))
 
@@ -207,7 +208,7 @@ def test_without_any_transform_the_planner_warns_and_starts_cold(monkeypatch):
     calls = record_starts(monkeypatch, planner)
     with pytest.warns(UserWarning, match="so every plan starts cold"):
         data = LineTask(planner.world_model).rollout(5, planner)
-    assert all(carried is None for carried, _ in calls)
+    assert [carried for carried, _ in calls] == [None] * 5
     assert ("next", "plan_mean") not in data.keys(True)
 
 
