@@ -832,6 +832,19 @@ def test_what_a_seed_policy_holds_is_saved_with_the_seed_phase_and_not_after_it(
     assert first.state_dict()["seed_policy"] is None
 
 
+def test_a_state_of_before_seed_policies_and_ends_were_saved_is_loaded():
+    options = {"init_random_frames": 9, "seed_policy": RandomActions()}
+    first, second = (make_collector(make_env((5,)), **options) for _ in range(2))
+    first.step()
+    state = first.state_dict()
+    for name in ("seed_policy", "ended_rows", "last_rows"):
+        del state[name]
+    with pytest.warns(UserWarning, match="fresh episodes begin"):
+        second.load_state_dict(state)
+    second.step()
+    assert second.frames == 2
+
+
 def test_a_seed_policy_that_is_no_module_has_nothing_to_save():
     def make() -> StepCollector:
         env = make_env((5,))
