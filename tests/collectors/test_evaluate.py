@@ -134,6 +134,24 @@ def test_an_episode_that_terminates_is_over_before_its_time_limit():
     assert evaluate(limited, ConstantPolicy(), episodes=1, on_step=look).lengths.tolist() == [3]
 
 
+def test_an_episode_may_end_in_a_nested_place():
+    class Nested(CountingEnv):
+        def __init__(self, length: int) -> None:
+            super().__init__(length)
+            self.full_done_spec = Composite(agent=self.full_done_spec.clone())
+
+        def _reset(self, tensordict: TensorDictBase | None) -> TensorDict:
+            return super()._reset(tensordict).update(self.full_done_spec.zero())
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDict:
+            after = super()._step(tensordict)
+            return after.exclude("done", "terminated").set("agent", after.select("done", "terminated"))
+
+    env = Nested(3)
+    assert "done" not in env.done_keys
+    assert evaluate(env, ConstantPolicy(), episodes=2).lengths.tolist() == [3, 3]
+
+
 def test_a_round_lasts_as_long_as_its_longest_episode():
     steps: list[Tensor] = []
     env = side_by_side(2, 5)
