@@ -107,3 +107,8 @@ def test_device_and_dtype_are_those_of_the_first_floating_point_tensor():
     assert device_and_dtype(Counter(), dtype=torch.float64)[1] == torch.float16
     assert device_and_dtype(nn.Module()) == (torch.device("cpu"), torch.float32)
     assert device_and_dtype(nn.Module(), "meta", torch.float64) == (torch.device("meta"), torch.float64)
+    torch.set_default_device("meta")
+    try:
+        assert device_and_dtype(nn.Module())[0].type == "meta"
+    finally:
+        torch.set_default_device(None)

@@ -128,6 +128,15 @@ def test_predictions_are_those_of_the_model_in_any_leading_batch(adapted):
     assert adapted.values(latent).shape == (1, 4, 1, 1) and adapted.termination(latent) is None
 
 
+def test_a_model_may_write_its_reward_at_the_root_and_its_states_below_next():
+    states = ["place", ("hidden", "mark")]
+    written = [("next", "place"), ("next", "hidden", "mark"), "reward"]
+    step = TensorDictModule(lambda x, m, a: (x + a, m, 3 * x), in_keys=[*states, "action"], out_keys=written)
+    model, latent, action = make(step), torch.tensor([[2.0, 5.0]]), torch.tensor([[0.5]])
+    assert model.reward(latent, action).tolist() == [6.0]
+    assert model.next(latent, action).tolist() == [[2.5, 5.0]]
+
+
 def test_an_imagined_rollout_follows_the_plan(adapted):
     env = LatentEnv(adapted)
     planner = EnsembleMPPIPlanner(env, horizon=2, num_samples=64, num_elites=8, num_proposals=0, warm_start=False)
