@@ -316,6 +316,14 @@ def test_many_changes_are_gathered_so_that_the_files_stay_about_as_large_as_the_
     assert size < 1.2 * run.buffer.storage[:].bytes()
 
 
+def test_one_part_of_the_targets_is_gathered_in_a_save(tmp_path):
+    run, journal = Pipeline(make_buffer(90)), ReplayJournal(tmp_path)
+    run.write(90)
+    journal.save(run.buffer)
+    run.refresh(90)
+    assert [len(journal.save(run.buffer)["targets"]) for _ in range(3)] == [5, 4, 3]  # bases and changes of three parts
+
+
 def test_a_large_buffer_is_split_into_files(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "ROWS_PER_FILE", 16)
     run, journal = Pipeline(make_buffer(100)), ReplayJournal(tmp_path)

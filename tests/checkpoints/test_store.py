@@ -517,6 +517,7 @@ def test_of_a_ring_that_has_wrapped_the_longest_stretch_is_left(store):
     work = Work()
     for step in range(1, 10):  # 45 rows into 30 places
         save(store, step, work.do())
+    assert [entry["begin"] for entry in replay_of(store, 9)["rows"]] == [15, 20, 25, 30, 35, 40]
     file = next(entry["file"] for entry in replay_of(store, 9)["rows"] if entry["begin"] == 35)
     damage(store.folder / "replay" / file, "a flipped bit")
     again = Work()
@@ -537,6 +538,18 @@ def test_rows_whose_targets_are_lost_are_left_out(store):
     with pytest.warns(UserWarning, match="5 of 15 rows"):
         CheckpointStore(store.folder).salvage(again.parts, again.buffer)
     assert torch.equal(again.buffer[:]["x"], work.buffer[10:15]["x"])
+
+
+def test_where_the_newest_weights_are_damaged_those_before_are_salvaged(store):
+    work = Work()
+    for step in (1, 2):
+        save(store, step, work.do())
+    damage(store.folder / "resume" / f"{2:012d}" / "layer.pt", "a flipped bit")
+    again = Work()
+    with pytest.warns(UserWarning, match=r"/000000000001 with its weights and 5 of 5 rows .*2/layer\.pt"):
+        CheckpointStore(store.folder).salvage(again.parts, again.buffer)
+    assert (again.counter.number, again.layer.weight[0, 0].item()) == (1, 1)
+    assert torch.equal(again.buffer[:]["x"], work.buffer[:5]["x"])
 
 
 def test_parts_that_are_damaged_everywhere_cannot_be_salvaged(store):
