@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from pathlib import Path
@@ -67,6 +68,27 @@ def trained(monkeypatch):
 
     monkeypatch.setattr(suite, "run_locally", run_locally)
     return queues
+
+
+@pytest.fixture
+def locks_held(monkeypatch):
+    """Those that the process has whenever it writes an experiment."""
+    lock, held, found = suite.file_lock, [], []
+
+    @contextlib.contextmanager
+    def locked(file):
+        with lock(file):
+            held.append(file.name)
+            yield
+            held.pop()
+
+    def write(*arguments):
+        found.append(list(held))
+        write_experiment(*arguments)
+
+    monkeypatch.setattr(suite, "file_lock", locked)
+    monkeypatch.setattr(suite, "write_experiment", write)
+    return found
 
 
 def test_the_committed_experiments_are_listed(call):
@@ -203,7 +225,9 @@ def test_an_experiment_is_trained_told_and_grown(call, mine, trained, tmp_path):
     assert out.splitlines()[-1] == "4 runs: 4 finished"
 
 
-def test_two_commands_that_begin_at_once_both_add_to_the_experiment(call, mine, trained, tmp_path, monkeypatch):
+def test_two_commands_that_begin_at_once_both_add_to_the_experiment(
+    call, mine, trained, tmp_path, monkeypatch, locks_held
+):
     check, calls = suite._require_parts, []
 
     def while_the_other_begins(runs) -> None:
@@ -217,6 +241,7 @@ def test_two_commands_that_begin_at_once_both_add_to_the_experiment(call, mine, 
     assert message == 0
     stored = read_experiment(tmp_path / "here" / "experiment.yaml")
     assert (sorted(stored.variants), sorted(stored.seeds)) == (["a", "b"], [1, 2])
+    assert locks_held == [[".experiment.lock"]] * 2
 
 
 def test_the_base_stays_when_a_command_trains_other_variants(call, mine, trained, tmp_path):
@@ -325,11 +350,12 @@ def test_a_suite_that_is_stopped_says_so_with_the_code_for_later(call, mine, mon
     assert out.splitlines()[-1] == "stopped; the same command goes on."
 
 
-def test_a_search_adds_its_trials_to_the_experiment(call, mine, trained, tmp_path):
+def test_a_search_adds_its_trials_to_the_experiment(call, mine, trained, tmp_path, locks_held):
     pytest.importorskip("optuna")
     search = {"search": {"optim.lr": {"low": 1e-4, "high": 1e-2, "log": True}}, "trials": 2}
     message, out = call(f"experiment={mine(variants={'a': {}, 'tuned': search})}", "runs_dir=here")
     assert message == 0
+    assert locks_held == [[".experiment.lock"]] * 3  # at the beginning, and for each trial
     stored = read_experiment(tmp_path / "here" / "experiment.yaml")
     assert [name for name in stored.variants if name.startswith("tuned trial")] == ["tuned trial 0", "tuned trial 1"]
     assert call("status", "runs_dir=here", "variants=tuned")[1].splitlines()[-1] == "4 runs: 4 finished"

@@ -268,14 +268,18 @@ def test_a_folder_that_cannot_be_written_needs_no_index(runs, small, tmp_path):
     assert RunIndex(tmp_path / "folder").read(runs)[0].state == "finished"
 
 
-def test_two_processes_may_use_the_index_at_once(runs, small, tmp_path):
+def test_two_processes_may_use_the_index_at_once(runs, small, tmp_path, monkeypatch):
     small.write_finished(runs[0])
     file = tmp_path / "index.sqlite"
     RunIndex(file).read(runs)
-    with sqlite3.connect(file) as database:
+    connect, patience = sqlite3.connect, []
+    with connect(file) as database:
         database.execute("BEGIN EXCLUSIVE")
-        assert RunIndex(file).read(runs[:1])[0].state == "finished"  # without waiting for it
+        note = lambda *names, timeout, **rest: patience.append(timeout) or connect(*names, timeout=timeout, **rest)  # noqa: E731
+        monkeypatch.setattr(sqlite3, "connect", note)
+        assert RunIndex(file).read(runs[:1])[0].state == "finished"
     database.close()
+    assert patience and max(patience) <= 0.5  # seconds that the other process is waited for
 
 
 @pytest.mark.slow

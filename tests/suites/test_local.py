@@ -128,16 +128,16 @@ def test_a_run_whose_trial_ended_early_is_asked_to_stop_once(small, tmp_path, mo
             self.told += 1
 
         def poll(self):
-            self.looks += self.told > 0
-            return self.returncode if self.looks > 5 else None  # it takes its time to save itself
+            self.looks += 1
+            return self.returncode if self.looks > 12 else None  # it takes its time to save itself
 
-    (run,) = small.experiment().runs(tmp_path)
-    queue, process = RunQueue([run]), Process()
-    monkeypatch.setattr(local, "start", lambda run, **places: process)
-    monkeypatch.setattr(queue, "to_be_stopped", lambda: queue._pruned.add(run.name) or {run.name})
+    runs = small.experiment(seeds=(1, 2)).runs(tmp_path)
+    queue, processes, names = RunQueue(runs), [], {run.name for run in runs}
+    monkeypatch.setattr(local, "start", lambda run, **places: processes.append(Process()) or processes[-1])
+    monkeypatch.setattr(queue, "to_be_stopped", lambda: queue._pruned.update(names) or names)
     assert run_locally(queue, workers=1)
-    assert process.told == 1
-    assert read_progress(run).state == "pruned"
+    assert [process.told for process in processes] == [1, 1]  # one after the other in the same place
+    assert {read_progress(run).state for run in runs} == {"pruned"}
 
 
 def test_nothing_is_left_running_if_the_suite_itself_fails(small, tmp_path, stand_in, monkeypatch):
