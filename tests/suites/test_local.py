@@ -43,6 +43,7 @@ def test_everything_that_can_be_finished_is(small, tmp_path, stand_in):
     assert small.log_of(runs[2])[-1] == "suite: failed: the simulator is gone"
     assert sum(line.endswith("; given up") for line in said) == 2
     assert sum("was stopped at" in line for line in said) == 4
+    assert [said.count(f"{runs[4].name}: {word}") for word in ("begins", "goes on")] == [1, 3]
 
 
 def test_as_many_run_at_a_time_as_there_are_workers(small, tmp_path, stand_in, monkeypatch):

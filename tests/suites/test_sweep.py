@@ -252,11 +252,11 @@ def test_a_step_at_which_fewer_than_five_trials_were_evaluated_ends_none_early(s
     for number in range(5):
         (run,) = sweep.propose()
         small.write_finished(run)
-        if number:  # its evaluation at step 100 has failed
+        if number == 0:  # its evaluation at step 100 has failed
             table = run.path / "eval.csv"
             table.write_text(table.read_text().replace("\n100,50,0,2.5,500.0", "\n100,50,0,2.5,nan"))
         assert sweep.look() == []
-    assert [100 in trial.intermediate_values for trial in study_of(tmp_path).trials] == [True, *[False] * 4]
+    assert [100 in trial.intermediate_values for trial in study_of(tmp_path).trials] == [False, *[True] * 4]
     (run,) = sweep.propose()
     small.write_tables(run, 100, returns=1.0)
     assert sweep.look() == []
