@@ -50,7 +50,7 @@ def pages_of(site: Path) -> list[Path]:
 
 
 def dead_links(site: Path) -> list[str]:
-    """Links within the site that lead nowhere, and files that are fetched from elsewhere."""
+    """Links within the site that lead nowhere."""
     read = {}
     for page in pages_of(site):
         read[page.resolve()] = parser = _Links()

@@ -383,13 +383,23 @@ def check_site():
         sys.path.remove(str(DOCS))
 
 
-def test_dead_links_and_undocumented_names_of_a_built_site_are_found(tmp_path, check_site):
+def test_dead_links_and_undocumented_names_of_a_built_site_are_found(tmp_path, check_site, generate, monkeypatch):
     (tmp_path / "a.html").write_text('<a href="b.html#here">x</a> <a href="gone.html">y</a> <img src="no.png">')
     (tmp_path / "b.html").write_text(
         '<p id="there">z</p><a href="a.html">back</a> <a href="https://example.com">out</a>'
     )
     found = check_site.dead_links(tmp_path)
     assert [fault.split(": ")[1].split(" ")[0] for fault in found] == ["b.html#here", "gone.html", "no.png"]
+    room = importlib.import_module("torchrl_etdmpc.checkpoints")
+    page = tmp_path / "docs" / "generated" / "api" / "checkpoints.html"
+    page.parent.mkdir(parents=True)
+    shown = {*room.__all__, "CheckpointStore.save", "Gone"} - {"CheckpointError"}
+    page.write_text("".join(f'<dt id="{room.__name__}.{name}">' for name in shown))
+    monkeypatch.setattr(generate, "ROOMS", ("checkpoints",))
+    assert check_site.undocumented(tmp_path) == [
+        "torchrl_etdmpc.checkpoints.CheckpointError is public and not documented",
+        "torchrl_etdmpc.checkpoints.Gone is documented and not public",
+    ]
 
 
 PAGE = """<!doctype html><html><head><meta name="viewport" content="width=device-width, initial-scale=1">
