@@ -159,12 +159,15 @@ def test_a_folder_of_other_files_is_refused_before_any_work(checkpoint, run_main
     assert message == "error: save=mine holds other files; choose an empty or a new folder."
 
 
-def test_the_seed_reaches_the_page(checkpoint, run_main, monkeypatch):
+def test_the_seed_and_who_may_reach_it_reach_the_page(checkpoint, run_main, monkeypatch):
     made: dict[str, Any] = {}
+    served: dict[str, Any] = {}
     monkeypatch.setattr("torchrl_etdmpc.commands.inspect_planner.make_page", lambda _, **given: made.update(given))
-    monkeypatch.setattr("torchrl_etdmpc.commands.inspect_planner.serve", lambda *_, **__: None)
-    assert run_main(f"checkpoint={checkpoint}", "state=0:0", "seed=17")[0] is None
-    assert made["seed"] == 17
+    monkeypatch.setattr("torchrl_etdmpc.commands.inspect_planner.serve", lambda _, **given: served.update(given))
+    settings = ("seed=17", "host=0.0.0.0", "port=0", "allow_remote=true")
+    assert run_main(f"checkpoint={checkpoint}", "state=0:0", *settings)[0] is None
+    assert (made["seed"], made["allow_remote"]) == (17, True)
+    assert (served["host"], served["port"], served["allow_remote"]) == ("0.0.0.0", 0, True)
 
 
 def test_a_missing_package_is_named_with_its_command(checkpoint, run_main, monkeypatch):

@@ -120,8 +120,13 @@ def test_the_page_answers_this_machine_only(served):
     caught.value.close()
 
 
+def test_a_page_that_may_be_reached_from_elsewhere_answers_by_any_name(inspection):
+    client = make_page(inspection, allow_remote=True).server.test_client()
+    assert client.get("/", headers={"Host": "another.example:8050"}).status_code == 200
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::"])
-def test_another_address_is_refused_unless_told(served, host):
+def test_another_address_is_refused_unless_told(host):
     with pytest.raises(
         ValueError, match=f"host must be this machine's own address, 127.0.0.1, got '{host}'.*allow_remote"
     ):
