@@ -207,7 +207,7 @@ def test_the_pages_are_linked_from_the_readme():
     assert [page for page in pages if f"]({page})" not in TEXTS["README.md"]] == []
 
 
-def test_the_columns_that_the_docs_name_are_those_of_a_run():
+def test_the_columns_that_every_table_of_evaluations_has_are_named():
     from torchrl_etdmpc.runs import EVAL_COLUMNS
 
     assert [column for column in EVAL_COLUMNS if f"`{column}`" not in TEXTS["docs/running.md"]] == []

@@ -338,8 +338,10 @@ def test_files_of_a_run_stay_where_they_were_named_if_an_environment_changes_the
 def test_a_command_trains_to_its_summary_and_lets_others_in(command, process, read_table):
     config = command(threads=1)
     torch.set_num_threads(2)
+    torch.set_float32_matmul_precision("highest")
     line = launch(config)
     assert torch.get_num_threads() == 2  # a sweep's next run may choose its own
+    assert torch.get_float32_matmul_precision() == "high"
     directory = RunDirectory(config.run_dir)
     assert line.startswith("cartpole-balance: return ")
     assert line.endswith(f"curve, tables and checkpoint are in {config.run_dir}")

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import itertools
 import json
 import math
+import re
 import shutil
 import time
 from pathlib import Path
@@ -36,6 +38,7 @@ from torchrl_etdmpc.training import (  # noqa: E402
 from torchrl_etdmpc.training.train import _draw_curve  # noqa: E402
 
 EPISODE = 20  # decisions, of every run here
+DOCS = Path(__file__).parents[2] / "docs" / "running.md"
 
 
 class Finished(NamedTuple):
@@ -154,6 +157,10 @@ def test_every_training_metric_is_there_and_finite(finished, read_table):
     names |= {"episode_return", "targets_refreshed", "targets_stale", "target_age"}
     names |= {"plan_fallbacks", "simulator_faults", "updates_skipped"}
     assert names <= set(rows[0])
+    (table,) = re.findall(r"^\| columns \| meaning \|\n(.*?)\n\n", DOCS.read_text(encoding="utf-8"), re.M | re.S)
+    told = [name for line in table.splitlines() for name in re.findall(r"`([\w*]+)`", line.split("|")[1])]
+    assert {name for name in told if not fnmatch.filter(rows[0], name)} == {"policy_value", "q_scale"}  # of TD-MPC2
+    assert [name for name in rows[0] if not any(fnmatch.fnmatch(name, one) for one in told)] == list(rows[0])[:4]
     for row in rows:
         assert [name for name, value in row.items() if not math.isfinite(value)] == []
     assert rows[-1]["targets_refreshed"] > rows[0]["targets_refreshed"] > 0
@@ -168,8 +175,10 @@ def test_the_training_return_is_that_of_the_episodes_since_the_last_row(finished
     assert [row["episode_return"] for row in read_table(finished.path / "train.csv")] == pytest.approx(expected)
 
 
-def test_the_summary_states_the_run_and_its_result(finished, read_table):
+def test_the_summary_states_the_run_and_its_result(finished, read_table, monkeypatch):
     summary = json.loads((finished.path / "summary.json").read_text())
+    (told,) = re.findall(r"`summary\.json` holds (.*?)\.\n", DOCS.read_text(encoding="utf-8"), re.S)
+    assert set(re.findall(r"`(\w+)`", told)) == set(summary)
     evaluations = [row["return_mean"] for row in read_table(finished.path / "eval.csv")]
     assert (summary["task"], summary["preset"], summary["seed"]) == ("cartpole-balance", "cpu", 1)
     assert summary["env_steps"] == 160
@@ -182,6 +191,11 @@ def test_the_summary_states_the_run_and_its_result(finished, read_table):
     assert (summary["device"], summary["processor"], summary["commit"]) == ("cpu", processor(), source_commit())
     assert {"python", "torch", "torchrl", "tensordict"} <= set(summary["versions"])
     assert {name: summary[name] for name in finished.summary} == finished.summary
+    assert summary["threads"] == torch.get_num_threads()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 99)  # closing batched environments may change it
+    monkeypatch.setattr("torchrl_etdmpc.training.train.source_commit", lambda: "of later files")
+    again = finished.run.summary()
+    assert [again[name] for name in ("threads", "commit")] == [summary[name] for name in ("threads", "commit")]
 
 
 def test_evaluations_play_other_episodes_than_training(finished):
