@@ -247,7 +247,7 @@ def test_the_study_of_the_ablation_has_the_areas_of_the_committed_files(committe
             cells += [script.written(*script.interval(each))]
             assert f"| {' | '.join(cells)} |" in page
             found += 1
-    assert found == 9
+    assert found == 10
 
 
 def test_the_study_of_the_ablation_has_what_all_four_parts_do(committed):
