@@ -100,7 +100,7 @@ def kill_and_go_on(
 ) -> None:
     """Kills the process at random moments, mostly between checkpoints and sometimes while one is written."""
     moments = random.Random(seed)
-    run_dir = directory / "run"
+    run_dir, codes = directory / "run", []
     for _ in range(kills):
         process = train(directory, "run_dir=run", "resume=auto", *arguments, **task)
         before = checkpoints(run_dir)
@@ -109,6 +109,8 @@ def kill_and_go_on(
         time.sleep(moments.uniform(0, 0.3))
         process.kill()
         process.communicate()
+        codes.append(process.returncode)
+    assert -signal.SIGKILL in codes
     finish(train(directory, "run_dir=run", "resume=auto", *arguments, **task))
 
 
