@@ -179,12 +179,14 @@ def test_a_helper_that_fails_does_so_in_silence_and_leaves_its_parts_to_this_pro
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_helper_imports_nothing_of_the_folder_that_the_run_was_begun_in(monkeypatch, tmp_path):
+def test_a_helper_finds_the_user_s_modules_and_the_folder_s_only_behind_all_others(monkeypatch, tmp_path):
     (tmp_path / "mine.py").touch()
+    (tmp_path / "random.py").write_text("raise SystemExit(3)")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(precompile, "_HELP", "import mine")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])  # as a task of one's own leaves it
+    monkeypatch.setattr(precompile, "_HELP", "import random, mine")
     with precompile._helper(("a", "request")) as helper:
-        assert helper.wait(60) == 1
+        assert helper.wait(60) == 0
 
 
 def test_a_helper_ends_with_the_one_that_it_helps(tiny_config):

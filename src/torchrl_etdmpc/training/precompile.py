@@ -91,8 +91,9 @@ def _helper(request: tuple[object, ...]) -> Iterator[subprocess.Popen[bytes]]:
     """A silent process that compiles some parts; what it does not manage to compile is left to this one."""
     settings = torch.get_num_threads(), torch.get_float32_matmul_precision()  # the cache goes by them too
     silent = subprocess.DEVNULL
-    # -P: -c would import a random.py of the folder that the run was begun in.
-    line = [sys.executable, "-P", "-c", _HELP]
+    # -P: -c would import a random.py of the folder that the run was begun in. What this process finds, e.g. the module
+    # of a user's task, is found behind what is installed.
+    line = [sys.executable, "-P", "-c", f"import sys; sys.path += {sys.path!r}; {_HELP}"]
     process = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=silent, stderr=silent)
     try:
         assert process.stdin is not None
