@@ -128,6 +128,19 @@ def test_an_episode_that_ends_inside_a_slice_is_refused_unless_the_rest_is_maske
     assert run_seeded(loss, slices)["loss_value"] == expected["loss_value"]
 
 
+@pytest.mark.parametrize("name", ["terminated", "done"])
+@pytest.mark.parametrize(
+    "change", [lambda flags: flags.expand(-1, -1, 2), lambda flags: flags[:, :1]], ids=["one an agent", "one a slice"]
+)
+def test_flags_that_are_not_one_for_each_step_are_refused(make_loss, slices, name, change):
+    flags = slices["next", "terminated"].zero_()
+    batch = TensorDict({key: value for key, value in slices.items(True, True)}, [])
+    batch["next", name] = change(flags)
+    message = rf"'{name}'\) must hold one flag for each step, here of shape \[4, 3, 1\], got \[4, .*; reduce it"
+    with pytest.raises(ValueError, match=message):
+        make_loss("model", ignore_termination=False)(batch)
+
+
 def test_rows_that_do_not_follow_each_other_are_a_warning(make_loss, slices):
     loss = make_loss("whole")
     slices["observation"][1, 1] += 1

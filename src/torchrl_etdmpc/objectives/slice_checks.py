@@ -17,18 +17,16 @@ from torch import Tensor
 from torchrl_etdmpc.keys import NEXT
 
 
-def refuse_termination(tensordict: TensorDictBase, key: NestedKey, counts: Tensor | None, owner: str) -> None:
+def refuse_termination(
+    tensordict: TensorDictBase, key: NestedKey, counts: Tensor | None, shape: torch.Size, owner: str
+) -> None:
     """Raises where a step terminates and no termination head learns it."""
     if torch.compiler.is_compiling():
         return
-    terminated = tensordict.get(key, None)
+    terminated = _flags(tensordict, key, "terminated", shape)
     if terminated is None:
-        _refuse_elsewhere(tensordict, key, "terminated")
-    if terminated is None or terminated.device.type != "cpu":
         return
-    if counts is not None:
-        terminated = terminated.reshape(counts.shape).bool() & counts
-    if terminated.any():
+    if (terminated if counts is None else terminated & counts).any():
         raise ValueError(
             f"{key!r} holds True, but the world model has no termination head, so values would "
             "be bootstrapped through the end of an episode; build WorldModel(..., termination=True), or pass "
@@ -47,12 +45,10 @@ def refuse_gaps(tensordict: TensorDictBase, done_key: NestedKey, counts: Tensor 
             "observations would be taken for those of one; leave MultiStep out, value_replayed=... has n-step "
             "targets."
         )
-    done = tensordict.get(done_key, None)
+    done = _flags(tensordict, done_key, "done", shape)
     if done is None:
-        _refuse_elsewhere(tensordict, done_key, "done")
-    if done is None or done.device.type != "cpu" or done.numel() != shape.numel():
         return
-    inside = done.reshape(shape)[:, :-1].bool()
+    inside = done[:, :-1]
     if (inside if counts is None else inside & counts[:, 1:]).any():
         raise ValueError(
             f"{done_key!r} is True before the last step of a slice, so that another episode follows in it; "
@@ -70,10 +66,10 @@ def refuse_unknown_ends(
     """An episode's last observation, and a slice's, is learned like all others, so it must be there."""
     if torch.compiler.is_compiling() or entries["action"].device.type != "cpu":
         return
-    done, shape = tensordict.get(done_key, None), entries["action"].shape[:2]
-    ends = torch.zeros(shape, dtype=torch.bool, device="cpu")  # whatever the default device is
-    if done is not None and done.device.type == "cpu" and done.numel() == shape.numel():
-        ends |= done.reshape(shape).bool()
+    shape = entries["action"].shape[:2]
+    ends = _flags(tensordict, done_key, "done", shape)
+    if ends is None:
+        ends = torch.zeros(shape, dtype=torch.bool, device="cpu")  # whatever the default device is
     last = ends.clone()
     last[:, -1] = True
     if counts is not None:  # the last one that counts; those behind it repeat another
@@ -110,6 +106,20 @@ def warn_of_holes(entries: Mapping[NestedKey, Any], counts: Tensor | None, keys:
             "them. Where an augmentation makes the two differ, ignore this.",
             stacklevel=4,
         )
+
+
+def _flags(tensordict: TensorDictBase, key: NestedKey, name: str, shape: torch.Size) -> Tensor | None:
+    """One flag for each step, bool ``[B, T]``; ``None`` where they are missing or not on a CPU."""
+    flags = tensordict.get(key, None)
+    if flags is None:
+        _refuse_elsewhere(tensordict, key, name)
+        return None
+    if flags.numel() != shape.numel() or flags.shape[:2] != shape:
+        raise ValueError(
+            f"{key!r} must hold one flag for each step, here of shape {[*shape, 1]}, got {list(flags.shape)}; reduce "
+            f"it, e.g. with .any(-1, keepdim=True), or name another key: loss.set_keys({name}=...)."
+        )
+    return flags.reshape(shape).bool() if flags.device.type == "cpu" else None
 
 
 def _refuse_elsewhere(tensordict: TensorDictBase, key: NestedKey, name: str) -> None:

@@ -105,10 +105,11 @@ class SliceReader:
                 raise self._shape_error(keys[name], entry)
         if 0 in entries["action"].shape[:2]:
             raise ValueError(f"{self.owner} needs at least one step, got {list(tensordict.batch_size)} slices.")
-        counts = self._counted_steps(tensordict, entries["action"].shape[:2])
+        shape = entries["action"].shape[:2]
+        counts = self._counted_steps(tensordict, shape)
         if self.terminated_key is not None:
-            refuse_termination(tensordict, self.terminated_key, counts, self.owner)
-        refuse_gaps(tensordict, self.done_key, counts, entries["action"].shape[:2])
+            refuse_termination(tensordict, self.terminated_key, counts, shape, self.owner)
+        refuse_gaps(tensordict, self.done_key, counts, shape)
         if counts is not None:
             # Before any maths: a zero in the place of a scale, say, has an infinite gradient, and 0 * inf is NaN. What
             # networks of the user's own read may be refused by them where it is zero, so they get what counts.
