@@ -438,6 +438,12 @@ def test_a_seed_phase_without_a_seed_policy_is_refused():
         make_collector(init_random_frames=10)
 
 
+def test_a_collector_without_a_buffer_is_refused():
+    env, policy = LineEnv(), SeedPolicy(LineEnv().action_spec)
+    with pytest.raises(ValueError, match=r"^StepCollector stores what it collects, got replay_buffer=None; pass a Rep"):
+        StepCollector(env, policy, replay_buffer=None)
+
+
 def test_an_unknown_insertion_is_refused():
     with pytest.raises(ValueError, match="insertion must be 'step' or 'episode', got 'batch'"):
         make_collector(insertion="batch")

@@ -103,6 +103,8 @@ class StepCollector(BaseCollector):
                 f"init_random_frames={init_random_frames} needs a seed_policy that writes what the policy writes; pass "
                 "seed_policy=SeedPolicy(env.action_spec)."
             )
+        if replay_buffer is None:
+            raise ValueError("StepCollector stores what it collects, got replay_buffer=None; pass a ReplayBuffer.")
         if insertion not in ("step", "episode"):
             raise ValueError(f"insertion must be 'step' or 'episode', got {insertion!r}.")
         if isinstance(exclude_keys, str) or "next" in exclude_keys:  # one key, taken for several
