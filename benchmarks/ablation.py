@@ -27,6 +27,8 @@ import numpy as np
 import pandas as pd
 from cpu_learning import RESULTS, ROOT, TASKS, half_interval
 from matplotlib.figure import Figure
+from scipy.optimize import brentq
+from scipy.stats import nct
 from scipy.stats import t as student
 
 from torchrl_etdmpc.analysis import read_runs
@@ -47,6 +49,10 @@ COLUMNS = (*map(str, STEPS), "area")
 HEADER = " | ".join([*(f"{step:,}" for step in STEPS), "area"])
 LEAST = 3
 """Tasks or seeds for an interval: that of two is thirteen times as wide as the two are apart."""
+SEEDS = (3, 5, 10, 20, 50)
+"""Numbers of seeds for which it is said what they would show."""
+POWER = 0.8
+"""How many of such experiments would show it."""
 
 
 def file_of(name: str) -> Path:
@@ -121,6 +127,21 @@ def interval_over_seeds(differences: pd.Series) -> tuple[float, float]:
     return tasks["mean"].mean(), half_interval(tasks["var"] / tasks["count"], tasks["count"])
 
 
+def least_seen(deviation: float, count: int) -> float:
+    """The least true difference that ``POWER`` of experiments with so many pairs tell from 0 at 95% (paired t test).
+
+    Args:
+        deviation: standard deviation of one pair's difference.
+        count: pairs.
+    """
+    critical = student.ppf(0.975, count - 1)
+
+    def too_seldom(effect: float) -> float:
+        return POWER - float(nct.sf(critical, count - 1, effect * count**0.5))
+
+    return deviation * brentq(too_seldom, 0, 10)
+
+
 def written(mean: float, half: float) -> str:
     """``+84 [-96, +265]``, or the mean alone."""
     return f"{mean:+.0f}" + ("" if np.isnan(half) else f" [{mean - half:+.0f}, {mean + half:+.0f}]")
@@ -165,7 +186,8 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
             lines.append(f"| {name} | {len(tasks)} | {' | '.join(cells)} |")
         lines += ["", *tasks_table(rows, experiment)]
         lines.append("")
-    return "\n".join([*lines, *returns_table(pairs, experiment), "", "![differences](differences.png)", ""])
+    lines += [*returns_table(pairs, experiment), "", *seen_table(pairs), "", "![differences](differences.png)", ""]
+    return "\n".join(lines)
 
 
 def tasks_table(rows: pd.DataFrame, experiment: Experiment) -> list[str]:
@@ -208,6 +230,33 @@ def returns_table(pairs: pd.DataFrame, experiment: Experiment) -> list[str]:
             numbers = ", ".join(map(str, sorted(returns.index)))
             cells = " | ".join(f"{mean:.0f}" for mean in returns.mean())
             lines.append(f"| {task if variant == experiment.base else ''} | {variant} | {numbers} | {cells} |")
+    return lines
+
+
+def seen_table(pairs: pd.DataFrame) -> list[str]:
+    """By task how much seeds differ, and what true difference so many of them would show."""
+    names = f"| task | of | variants | pairs | deviation | {' | '.join(f'{count} seeds' for count in SEEDS)} |"
+    lines = [
+        "## What would be seen",
+        "",
+        f"The least true difference from the preset that {POWER:.0%} of experiments with so many seeds would tell from",
+        "0 (paired t test at 95%). *Deviation* is the standard deviation of the differences of seeds from their",
+        f"variant's mean, of all variants with {LEAST} seeds or more together. These share the preset's runs, so it is",
+        "a rough one.",
+        "",
+        names,
+        "|---" * (5 + len(SEEDS)) + "|",
+    ]
+    for task, rows in pairs.groupby("task"):
+        for column, name in ((str(ENV_STEPS), f"return at {ENV_STEPS:,}"), ("area", "area")):
+            spread = differences(rows, column).groupby("variant").agg(["var", "count"])
+            spread = spread[spread["count"] >= LEAST]
+            if spread.empty:
+                continue
+            free = spread["count"] - 1
+            deviation = float((spread["var"] * free).sum() / free.sum()) ** 0.5
+            cells = " | ".join(f"{least_seen(deviation, count):.0f}" for count in SEEDS)
+            lines.append(f"| {task} | {name} | {len(spread)} | {spread['count'].sum()} | {deviation:.0f} | {cells} |")
     return lines
 
 

@@ -6,10 +6,12 @@ import importlib
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
-pytest.importorskip("pandas")
+pd = pytest.importorskip("pandas")
+ttest_1samp = pytest.importorskip("scipy.stats").ttest_1samp
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
@@ -94,6 +96,29 @@ def test_tasks_with_few_seeds_are_not_in_the_interval_over_seeds(script, tmp_pat
 def test_seeds_that_all_differ_alike_leave_no_doubt(script):
     index = script.pd.MultiIndex.from_product([["walker-run", "walker-walk"], [1, 2, 3]], names=["task", "seed"])
     assert script.interval_over_seeds(script.pd.Series(5.0, index)) == (5.0, 0.0)
+
+
+def test_what_so_many_seeds_would_show(script):
+    """Textbooks have 34 pairs for half a standard deviation, at 80% and 95%; 33 fall short of it."""
+    assert script.least_seen(2.0, 34) < 1 < script.least_seen(2.0, 33)
+    draws = np.random.default_rng(0).normal(script.least_seen(7.0, 5), 7.0, (20_000, 5))
+    seen = ttest_1samp(draws, 0, axis=1).pvalue < 0.05
+    assert seen.mean() == pytest.approx(0.8, abs=0.01)
+
+
+def test_how_much_seeds_differ_is_of_all_variants_with_enough_of_them(script):
+    index = ["variant", "task", "seed"]
+    gains = {"one head": [0.0, 30.0, 60.0], "final depth": [5.0, 5.0, 5.0, 5.0, 5.0], "UTD 2": [0.0, 900.0]}
+    rows = [
+        {"variant": variant, "task": "walker-run", "seed": seed}
+        | {f"{name} {column}": gain * (name == "variant") for name in ("base", "variant") for column in script.COLUMNS}
+        for variant, found in gains.items()
+        for seed, gain in enumerate(found, start=1)
+    ]
+    table = script.seen_table(pd.DataFrame(rows).set_index(index))
+    # Variances of 900 and 0, of two and four degrees of freedom.
+    assert [line for line in table if "walker-run | area | 2 | 8 | 17 | " in line]
+    assert len([line for line in table if line.startswith("| walker-run")]) == 2
 
 
 def test_the_figure_is_of_the_variants_that_were_run_on_several_tasks(script):
