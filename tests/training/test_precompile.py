@@ -16,7 +16,7 @@ from torchrl.envs.utils import exploration_type
 
 from torchrl_etdmpc.objectives import Term
 from torchrl_etdmpc.testing import random_slices
-from torchrl_etdmpc.training import DistributedConfig, build_agent, build_replay, precompile
+from torchrl_etdmpc.training import DistributedConfig, build_agent, build_replay, own_code, precompile
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("g++", "clang++", "c++"))), reason="needs a C++ compiler"
@@ -187,6 +187,20 @@ def test_a_helper_finds_the_user_s_modules_and_the_folder_s_only_behind_all_othe
     monkeypatch.setattr(precompile, "_HELP", "import random, mine")
     with precompile._helper(("a", "request")) as helper:
         assert helper.wait(60) == 0
+
+
+def test_a_helper_follows_the_code_that_the_one_that_it_helps_has_followed(monkeypatch, tmp_path, tiny_config):
+    (tmp_path / "of_mine.py").write_text(
+        "def score(returns): return returns.mean((-3, -2, -1))\ndef terms(world_model): return []\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(own_code, "_followed", {})
+    score, terms = "of_mine:score", "of_mine:terms"
+    for name, value in {"planner.score": score, "reanalyze.score": score, "loss.extra_terms": terms}.items():
+        own_code.follow_own_code(name, value)
+    config = tiny_config(planner={"score": score}, reanalyze={"score": score}, loss={"extra_terms": terms})
+    with precompile._helper((config, 5, 1, (1,), (2,), [])) as helper:
+        assert helper.wait(100) == 0
 
 
 def test_a_helper_ends_with_the_one_that_it_helps(tiny_config):

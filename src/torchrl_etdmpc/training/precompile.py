@@ -20,6 +20,7 @@ from torchrl_etdmpc.runs import first_line, progress_bar, usable_cores
 from torchrl_etdmpc.training.agent import Agent, build_agent
 from torchrl_etdmpc.training.config import TrainConfig
 from torchrl_etdmpc.training.distributed import DistributedConfig
+from torchrl_etdmpc.training.own_code import follow_own_code
 
 _HELP = "from torchrl_etdmpc.training.precompile import help_to_compile; help_to_compile()"
 
@@ -111,6 +112,10 @@ def help_to_compile() -> None:
     torch.set_num_threads(threads)
     if precision != torch.get_float32_matmul_precision():  # setting what it is changes what the cache goes by
         torch.set_float32_matmul_precision(precision)
+    # As the process has that asks: code of the user's own behind a setting.
+    follow_own_code("planner.score", config.planner.score)
+    follow_own_code("reanalyze.score", config.reanalyze.score)
+    follow_own_code("loss.extra_terms", config.loss.extra_terms or "null")
     parts = _parts(config, build_agent(config, *network), batch, eval_batch)
     for name in names:
         parts[name]()
