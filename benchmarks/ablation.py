@@ -113,12 +113,12 @@ def read_pairs(folder: Path, base: str) -> tuple[pd.DataFrame, list[str]]:
     return pd.DataFrame(rows).set_index(["variant", "task", "seed"]), alone
 
 
-def interval(differences: pd.Series) -> tuple[float, float]:
-    """Mean and half of its 95% interval (Student's t; NaN for fewer than ``LEAST`` differences)."""
+def interval(differences: pd.Series, level: float = 0.95) -> tuple[float, float]:
+    """Mean and half of its interval (Student's t; NaN for fewer than ``LEAST`` differences)."""
     count = len(differences)
     if count < LEAST:
         return differences.mean(), float("nan")
-    return differences.mean(), student.ppf(0.975, count - 1) * differences.std() / count**0.5
+    return differences.mean(), student.ppf((1 + level) / 2, count - 1) * differences.std() / count**0.5
 
 
 def interval_over_seeds(differences: pd.Series) -> tuple[float, float]:
@@ -184,8 +184,7 @@ def report(pairs: pd.DataFrame, experiment: Experiment, alone: Sequence[str] = (
         for name, tasks in groups(by_task.index, experiment.tasks).items():
             cells = [written(*interval(differences(by_task.loc[tasks], column))) for column in COLUMNS]
             lines.append(f"| {name} | {len(tasks)} | {' | '.join(cells)} |")
-        lines += ["", *tasks_table(rows, experiment)]
-        lines.append("")
+        lines += ["", *tasks_table(rows, experiment), "", *without_zero(rows)]
     lines += [*returns_table(pairs, experiment), "", *seen_table(pairs), "", "![differences](differences.png)", ""]
     return "\n".join(lines)
 
@@ -210,6 +209,28 @@ def tasks_table(rows: pd.DataFrame, experiment: Experiment) -> list[str]:
         cells += [written(*interval_over_seeds(each.loc[enough])) for each in found]
         lines.append(f"| {name} |  | {' | '.join(cells)} |")
     return lines
+
+
+def without_zero(rows: pd.DataFrame) -> list[str]:
+    """How many intervals of ``LEAST`` tasks or more leave out 0, and which at a level that allows for their number."""
+    found = {
+        f"{task} ({'area' if column == 'area' else 'return'})": seeds
+        for column in (str(ENV_STEPS), "area")
+        for task, seeds in differences(rows, column).groupby("task")
+        if len(seeds) >= LEAST
+    }
+    if len(found) < 2 * LEAST:
+        return []
+    level = 1 - 0.05 / len(found)
+    likely, sure = (
+        [name for name, seeds in found.items() if abs(seeds.mean()) > interval(seeds, at)[1]] for at in (0.95, level)
+    )
+    return [
+        f"Of these {len(found)} intervals of single tasks {len(likely)} leave out 0, where chance alone makes "
+        f"{0.05 * len(found):.1f} do so.",
+        f"At {level:.2%}, which allows for their number (Bonferroni): {', '.join(sure) or 'none'}.",
+        "",
+    ]
 
 
 def differences(rows: pd.DataFrame, column: str) -> pd.Series:

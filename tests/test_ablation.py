@@ -121,6 +121,21 @@ def test_how_much_seeds_differ_is_of_all_variants_with_enough_of_them(script):
     assert len([line for line in table if line.startswith("| walker-run")]) == 2
 
 
+def test_of_many_intervals_some_leave_out_zero_by_chance(script):
+    """The t values are infinite, 5.20 and 1.73; that of 95% is 4.30, that of 99.17% is 10.89."""
+    gains = {"walker-run": [9.0, 9.0, 9.0], "hopper-stand": [20.0, 30.0, 40.0], "fish-swim": [0.0, 10.0, 20.0]}
+    rows = [
+        {"task": task, "seed": seed, "base 50000": 0.0, "base area": 0.0, "variant 50000": gain, "variant area": gain}
+        for task, found in gains.items()
+        for seed, gain in enumerate(found, start=1)
+    ]
+    pairs = pd.DataFrame(rows).set_index(["task", "seed"]).sort_index()
+    said = script.without_zero(pairs)
+    assert said[0] == "Of these 6 intervals of single tasks 4 leave out 0, where chance alone makes 0.3 do so."
+    assert said[1].startswith("At 99.17%, ") and said[1].endswith(": walker-run (return), walker-run (area).")
+    assert script.without_zero(pairs.drop("fish-swim")) == []
+
+
 def test_the_figure_is_of_the_variants_that_were_run_on_several_tasks(script):
     def panels(**tasks: list[str]) -> list[str]:
         runs = [(name.replace("_", " "), task, 1) for name, each in tasks.items() for task in each]
