@@ -295,21 +295,22 @@ def test_the_study_of_the_ablation_has_what_all_four_parts_do(committed):
     _, experiment, pairs, _ = read("cpu-ablation")
     page = " ".join((BENCHMARKS.parent / "docs" / "studies" / "ablation.md").read_text().split())
     rows = pairs.xs("all four off (BMPC)", level="variant")
-    complete = [row for row in script.tasks_table(rows, experiment) if "| 1, 2, 3, 4, 5 |" in row]
-    assert len(complete) == 6
-    assert [row for row in complete if row not in page] == []
+    by_task = [row for row in script.tasks_table(rows, experiment)[2:] if not row.startswith("| these tasks")]
+    assert len(by_task) == 15
+    assert [row for row in by_task if row not in page] == []
 
-    columns = (str(script.ENV_STEPS), "area")
-    by_task = rows.groupby("task").mean()
-    named = {
-        "the five of the experiment": list(experiment.tasks),
-        "all 15 that the preset was not tuned on": list(by_task.index),
-    }
+    named = {"the five of the experiment": experiment.tasks, "all 15 that the preset was not tuned on": None}
     for name, tasks in named.items():
-        cells = [script.written(*script.interval(script.differences(by_task.loc[tasks], column))) for column in columns]
-        assert f"| {name} | {' | '.join(cells)} |" in page
-    ends = []
-    for column in columns:
-        mean, half = script.interval_over_seeds(script.differences(rows, column).loc[list(experiment.tasks)])
-        ends.append(f"between {mean - half:+.0f} and {mean + half:+.0f}")
-    assert f"{ends[0]} at 50,000, and {ends[1]} in area" in page
+        cells = [name]
+        for column in (str(script.ENV_STEPS), "area"):
+            found = script.differences(rows, column).loc[slice(None) if tasks is None else list(tasks)]
+            intervals = [script.interval(found.groupby("task").mean()), script.interval_over_seeds(found)]
+            cells.append(f"{intervals[0][0]:+.0f}")
+            cells += [f"{mean - half:+.0f} to {mean + half:+.0f}" for mean, half in intervals]
+        assert f"| {' | '.join(cells)} |" in page
+
+    seen = {tuple(row.split(" | ")[:2]): row.split(" | ") for row in script.seen_table(pairs) if " | area | " in row}
+    walker, hopper = (seen[f"| {task}", "area"] for task in ("walker-run", "hopper-stand"))
+    five, twenty = (5 + script.SEEDS.index(count) for count in (5, 20))
+    assert f"areas of {walker[five]} with five seeds of walker-run and of {walker[twenty]} with 20; " in page
+    assert f"of hopper-stand it takes {hopper[five]} with five and {hopper[twenty]} with 20. " in page
