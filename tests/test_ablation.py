@@ -314,3 +314,15 @@ def test_the_study_of_the_ablation_has_what_all_four_parts_do(committed):
     five, twenty = (5 + script.SEEDS.index(count) for count in (5, 20))
     assert f"areas of {walker[five]} with five seeds of walker-run and of {walker[twenty]} with 20; " in page
     assert f"of hopper-stand it takes {hopper[five]} with five and {hopper[twenty]} with 20. " in page
+
+
+def test_the_study_of_the_ablation_has_the_returns_on_cartpole_balance_sparse(committed):
+    script, read = committed
+    _, experiment, pairs, _ = read("cpu-ablation")
+    page = (BENCHMARKS.parent / "docs" / "studies" / "ablation.md").read_text()
+    rows = pairs.xs("cartpole-balance-sparse", level="task")
+    for variant in script.in_order(rows, experiment):
+        for seed, row in rows.loc[variant].iterrows():
+            for who, kind in ((experiment.base, "base"), (variant, "variant")):
+                cells = " | ".join(f"{row[f'{kind} {column}']:.0f}" for column in script.COLUMNS)
+                assert f"| {seed if kind == 'base' else ''} | {who} | {cells} |" in page
