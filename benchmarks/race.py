@@ -4,14 +4,16 @@
     python benchmarks/race.py                                # what is missing, run by run: 13 hours a seed
     python benchmarks/race.py --tasks walker-walk --algorithms tqc --settings zoo --seeds 1
     python benchmarks/race.py --report-only RUN_DIRECTORY... # figure and table, beside finished runs of ours
+    python benchmarks/race.py --clock 2 --report-only RUN_DIRECTORY...  # with the minutes of seed 2 alone
 
 The same physics, action repeat, evaluation (mean of 10 episodes without noise on starts that the run's seed gives) and
 one thread. Two settings each, because a library is worth what its better one reaches: `default` is
 Stable-Baselines3's own, `zoo` is what RL Baselines3 Zoo tuned for PyBullet's locomotion tasks (state-dependent
 exploration; hyperparameters of HalfCheetahBulletEnv). Minutes count everything but imports: evaluations too, and for
-ours compilation. Writes `benchmarks/results/cpu/race/<method>/<task>/seed<k>/` and, there, `race.png` and `README.md`,
-whose table has mean returns over seeds: after so many env steps, with the minutes until then, and of what each run has
-after so many minutes, where one that has ended keeps its last return.
+ours compilation. They are compared where they are of one machine: those of the seeds that `--clock` names, whatever
+seeds the returns are of. Writes `benchmarks/results/cpu/race/<method>/<task>/seed<k>/` and, there, `race.png` and
+`README.md`, whose table has mean returns over seeds: after so many env steps, with the mean of the minutes until then,
+and the last one that is reached within so many minutes, where a method that has ended keeps its last return.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import argparse
 import importlib.metadata
 import json
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -40,7 +43,7 @@ from torchrl_etdmpc.analysis.runs import read_evaluations
 from torchrl_etdmpc.collectors import evaluate
 from torchrl_etdmpc.envs import get_task, make_env
 from torchrl_etdmpc.envs.dmc import domain_and_task
-from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions
+from torchrl_etdmpc.runs import RunDirectory, RunLog, library_versions, processor
 
 FOLDER = RESULTS / "race"
 TASKS = ("walker-walk", "cheetah-run", "reacher-easy", "cartpole-swingup")
@@ -139,7 +142,8 @@ def train(task: str, algorithm: str, settings: str, seed: int, target: Path, env
     versions = library_versions()
     versions |= {name: importlib.metadata.version(name) for name in ("stable-baselines3", "sb3-contrib")}
     summary = {"task": task, "preset": method, "seed": seed, "env_steps": env_steps, "final_return": final}
-    log.finish({**summary, "wall_time_s": round(time.perf_counter() - began, 1), "threads": 1, "versions": versions})
+    summary |= {"wall_time_s": round(time.perf_counter() - began, 1), "processor": processor(), "threads": 1}
+    log.finish({**summary, "versions": versions})
     directory.close()
     starts.close()
     return f"{task}, {method}, seed {seed}: return {final:.0f} in {(time.perf_counter() - began) / 60:.0f} min"
@@ -151,15 +155,30 @@ def _style(method: str) -> dict[str, str]:
     return {"color": color, "marker": marker, "linestyle": "--" if "(zoo)" in method else "-"}
 
 
-def report(ours: list[Path]) -> str:
-    """Figure and table of every method over env steps and over minutes."""
+def _cell(mean: float, minutes: float) -> str:
+    """``"834 (15.9)"``, or ``"834"`` where no minutes are known, or a dash where no return is."""
+    if np.isnan(mean):
+        return "–"
+    return f"{mean:.0f}" if np.isnan(minutes) else f"{mean:.0f} ({minutes:.1f})"
+
+
+def report(ours: list[Path], clock: list[int] | None = None) -> str:
+    """Figure and table of every method over env steps and over minutes.
+
+    Args:
+        ours: run directories of the preset, finished or not.
+        clock: the seeds whose minutes are shown; all of them by default.
+    """
     runs = [run for run in map(Run.read, find_runs([FOLDER, *ours])) if run.task in TASKS and run.finished]
+    timed = [run for run in runs if clock is None or run.seed in clock]
+    if not timed:
+        sys.exit("error: no finished run to time by; run this script first, or name other seeds by --clock.")
     curves = join_runs(runs)
     methods = [*sorted(set(curves["method"]) - {"cpu"}), "cpu"]
     styles = {method: _style(method) for method in methods}
-    clocks = [read_evaluations(run.path).assign(task=run.task, method=run.method, seed=run.seed) for run in runs]
-    clock = pd.concat(clocks).assign(minutes=lambda rows: rows["wall_time_s"] / 60)
-    minutes = clock.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
+    clocks = [read_evaluations(run.path).assign(task=run.task, method=run.method) for run in timed]
+    minutes = pd.concat(clocks).assign(minutes=lambda rows: rows["wall_time_s"] / 60)
+    minutes = minutes.groupby(["task", "method", "env_steps"])[["minutes"]].mean()
     found = add_interval(estimate(curves)).join(minutes, on=["task", "method", "env_steps"])
     tasks = [task for task in TASKS if task in set(found["task"])]
     figure = Figure(figsize=(3.1 * len(tasks), 5.2), layout="constrained")
@@ -183,18 +202,19 @@ def report(ours: list[Path]) -> str:
     ran = {run.path.relative_to(FOLDER).parts[0] for run in runs if run.path.is_relative_to(FOLDER)}
     missing = [f"{a}-{s}" for a in ALGORITHMS for s in SETTINGS if f"{a}-{s}" not in ran]
     lines += [f"Not run yet: {', '.join(missing)}.", ""] if missing else []
-    heads = [f"{steps:,} env steps" for steps in STEPS] + [f"{minutes} minutes" for minutes in MINUTES]
+    heads = [f"{steps:,} env steps" for steps in STEPS] + [f"{limit} minutes" for limit in MINUTES]
     lines += [f"| task | method | seeds | {' | '.join(heads)} |"]
     lines += ["|---" * (3 + len(heads)) + "|"]
     for (task, method), rows in found.groupby(["task", "method"]):
         rows = rows.set_index("env_steps")
         seeds = curves[(curves["task"] == task) & (curves["method"] == method)]["seed"].nunique()
-        cells = [f"{rows['mean'][at]:.0f} ({rows['minutes'][at]:.1f})" if at in rows.index else "–" for at in STEPS]
-        own = clock[(clock["task"] == task) & (clock["method"] == method)]
-        within = [own[own["minutes"] <= minutes].groupby("seed")["return_mean"].last() for minutes in MINUTES]
-        cells += [f"{each.mean():.0f}" if len(each) == seeds else "–" for each in within]
+        cells = [_cell(mean, at) for mean, at in rows.reindex(STEPS)[["mean", "minutes"]].to_numpy()]
+        within = [rows["mean"][rows["minutes"] <= limit] for limit in MINUTES]
+        cells += [f"{each.iloc[-1]:.0f}" if len(each) else "–" for each in within]
         lines.append(f"| {task} | {method} | {seeds} | " + " | ".join(cells) + " |")
     beside = [os.path.relpath(run.path, RESULTS) for run in runs if not run.path.is_relative_to(FOLDER)]
+    if clock is not None:
+        lines += ["", f"Minutes are those of seed {', '.join(map(str, clock))}."]
     lines += ["", f"Runs of ours, below `benchmarks/results/cpu`: {', '.join(beside)}."]
     versions = {json.dumps(json.loads(path.read_text())["versions"]) for path in FOLDER.rglob("summary.json")}
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
@@ -209,6 +229,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
     parser.add_argument("--out", type=Path, default=FOLDER)
+    parser.add_argument("--clock", nargs="+", type=int, metavar="SEED")
     parser.add_argument("--report-only", nargs="*", type=Path, metavar="RUNS")
     arguments = parser.parse_args()
     if arguments.report_only is None:
@@ -220,7 +241,7 @@ def main() -> None:
                         if not RunDirectory(target).finished:
                             print(train(task, algorithm, settings, seed, target, arguments.env_steps), flush=True)
     else:
-        (FOLDER / "README.md").write_text(report(arguments.report_only))
+        (FOLDER / "README.md").write_text(report(arguments.report_only, arguments.clock))
 
 
 if __name__ == "__main__":

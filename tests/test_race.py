@@ -105,6 +105,16 @@ def test_a_run_is_evaluated_as_ours_are_and_stands_beside_them(script, tmp_path,
     (slower / "eval.csv").write_text("\n".join([header, *rows, ""]))
     script.main()
     page = (script.FOLDER / "README.md").read_text()
-    # The slower one has 500 after 15 minutes, 900 after 27: each run counts with what it has by then.
-    assert "| cartpole-swingup | cpu | 2 | 500 (12.5) | – | – | 250 | 500 | 700 |" in page
+    # 50,000 env steps take 10 and 15 minutes, 90,000 take 18 and 27: in the mean 12.5 and 22.5.
+    assert "| cartpole-swingup | cpu | 2 | 500 (12.5) | – | – | 0 | 500 | 900 | 900 |" in page
+    monkeypatch.setattr(sys, "argv", ["race.py", "--clock", "2", "--report-only", str(tmp_path / "cpu")])
+    script.main()
+    page = (script.FOLDER / "README.md").read_text()
+    # The minutes of the second run alone, the returns of both; those who have no run with that seed have no minutes.
+    assert "| cartpole-swingup | cpu | 2 | 500 (15.0) | – | – | 0 | 500 | 500 | 900 |" in page
+    assert "| cartpole-swingup | TQC (zoo) | 1 | – | – | – | – | – | – | – |" in page
+    assert "Minutes are those of seed 2." in page
+    monkeypatch.setattr(sys, "argv", ["race.py", "--clock", "3", "--report-only", str(tmp_path / "cpu")])
+    with pytest.raises(SystemExit, match="name other seeds by --clock"):
+        script.main()
     assert (script.FOLDER / "race.png").read_bytes().startswith(b"\x89PNG")
