@@ -233,6 +233,8 @@ def main() -> None:
     parser.add_argument("--report-only", nargs="*", type=Path, metavar="RUNS")
     arguments = parser.parse_args()
     if arguments.report_only is None:
+        if arguments.clock is not None:
+            parser.error("--clock says whose minutes a report shows; give it together with --report-only.")
         for seed in arguments.seeds:
             for task in arguments.tasks:
                 for algorithm in arguments.algorithms:

@@ -326,3 +326,20 @@ def test_the_study_of_the_ablation_has_the_returns_on_cartpole_balance_sparse(co
             for who, kind in ((experiment.base, "base"), (variant, "variant")):
                 cells = " | ".join(f"{row[f'{kind} {column}']:.0f}" for column in script.COLUMNS)
                 assert f"| {seed if kind == 'base' else ''} | {who} | {cells} |" in page
+
+
+def test_the_study_of_the_ablation_has_the_returns_by_either_score(committed):
+    script, _ = committed
+    page = (BENCHMARKS.parent / "docs" / "studies" / "ablation.md").read_text()
+    table = script.pd.read_csv(script.RESULTS / "ablation" / "first_evaluation.csv")
+    returns = table.set_index(["learned_with", "acts_by", "seed"])["return_mean"].sort_index()
+    for name, label in (("cpu", "the mean over depths (cpu)"), ("final depth", "the last depth (final depth)")):
+        cells = [", ".join(f"{value:.0f}" for value in returns[name, score]) for score in ("mean", "final")]
+        assert f"| {label} | {' | '.join(cells)} |" in page
+    ahead = returns["final depth"] - returns["cpu"]
+    other = returns.xs("final", level="acts_by") - returns.xs("mean", level="acts_by")
+    said = " ".join(page.split())
+    assert f"by {ahead.min():.0f} to {ahead.max():.0f} and by {ahead.mean():.0f} in the mean of the eight pairs" in said
+    between = f"between {-other.min():.0f} less and {other.max():.0f} more"
+    assert f"gives {other.mean():.0f} more in the mean, {between}" in said
+    assert f"standard deviations over episodes are up to {table['return_std'].max():.0f}:" in said

@@ -118,3 +118,11 @@ def test_a_run_is_evaluated_as_ours_are_and_stands_beside_them(script, tmp_path,
     with pytest.raises(SystemExit, match="name other seeds by --clock"):
         script.main()
     assert (script.FOLDER / "race.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_clock_without_a_report_is_refused_before_anything_is_trained(script, monkeypatch, capsys):
+    monkeypatch.setattr(script, "train", lambda *arguments: pytest.fail("trains"))
+    monkeypatch.setattr(sys, "argv", ["race.py", "--clock", "2"])
+    with pytest.raises(SystemExit):
+        script.main()
+    assert "give it together with --report-only." in capsys.readouterr().err
