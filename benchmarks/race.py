@@ -212,10 +212,10 @@ def report(ours: list[Path], clock: list[int] | None = None) -> str:
         within = [rows["mean"][rows["minutes"] <= limit] for limit in MINUTES]
         cells += [f"{each.iloc[-1]:.0f}" if len(each) else "–" for each in within]
         lines.append(f"| {task} | {method} | {seeds} | " + " | ".join(cells) + " |")
-    beside = [os.path.relpath(run.path, RESULTS) for run in runs if not run.path.is_relative_to(FOLDER)]
+    own = [os.path.relpath(run.path, RESULTS) for run in runs if run.method == "cpu"]
     if clock is not None:
         lines += ["", f"Minutes are those of seed {', '.join(map(str, clock))}."]
-    lines += ["", f"Runs of ours, below `benchmarks/results/cpu`: {', '.join(beside)}."]
+    lines += ["", f"Runs of ours, below `benchmarks/results/cpu`: {', '.join(own)}."]
     versions = {json.dumps(json.loads(path.read_text())["versions"]) for path in FOLDER.rglob("summary.json")}
     lines += ["", "Versions: " + "; ".join(sorted(versions)).replace('"', "") + "."]
     return "\n".join([*lines, "", "![race](race.png)", ""])
