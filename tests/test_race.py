@@ -126,3 +126,19 @@ def test_a_clock_without_a_report_is_refused_before_anything_is_trained(script, 
     with pytest.raises(SystemExit):
         script.main()
     assert "give it together with --report-only." in capsys.readouterr().err
+
+
+def test_the_page_of_results_has_the_returns_of_the_committed_table():
+    table: dict[str, dict[str, list[float]]] = {}
+    for line in (BENCHMARKS / "results" / "cpu" / "race" / "README.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 10 and cells[2].isdecimal():
+            returns = [float(cell.partition(" ")[0].replace("–", "nan")) for cell in cells[3:6]]
+            table.setdefault(cells[0], {})[cells[1].replace("zoo", "tuned")] = returns
+    page = (BENCHMARKS.parent / "docs" / "results.md").read_text()
+    assert len(table) == 4
+    for task, methods in table.items():
+        ours = methods.pop("cpu")
+        best = [max(methods, key=lambda name, column=column: methods[name][column]) for column in range(3)]
+        others = [f"{name.replace('(', '').replace(')', '')} {methods[name][i]:.0f}" for i, name in enumerate(best)]
+        assert f"| {task} | {ours[0]:.0f} | {ours[1]:.0f} | {' | '.join(others)} |" in page
